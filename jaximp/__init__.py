@@ -1,0 +1,33 @@
+"""jaximp: mechanical impedance of human joints and arms, and the dynamics of the robots that hold them."""
+
+from jaximp import models
+from jaximp.identify import Estimates, identify, identify_recording
+from jaximp.job import Job, parse_job, read_job
+from jaximp.least_squares import WindowFit, confidence_interval, least_squares
+from jaximp.recordings import load_recording, recording_from_arrays, save_recording
+from jaximp.recursive import RecursiveFit, recursive_least_squares
+from jaximp.trajectories import FourierSeries
+from jaximp.types import Recording
+from jaximp.windows import SlidingFit, sliding_least_squares
+
+__all__ = [
+    "Estimates",
+    "FourierSeries",
+    "Job",
+    "Recording",
+    "RecursiveFit",
+    "SlidingFit",
+    "WindowFit",
+    "confidence_interval",
+    "identify",
+    "identify_recording",
+    "least_squares",
+    "load_recording",
+    "models",
+    "parse_job",
+    "read_job",
+    "recording_from_arrays",
+    "recursive_least_squares",
+    "save_recording",
+    "sliding_least_squares",
+]

@@ -1,0 +1,194 @@
+"""The command line: `jaximp demo | check | identify | simulate | reproduce`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from jaximp.types import Progress
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Identify the mechanical impedance of human joints, and the dynamics of the robots that hold them.\n\n"
+    "Begin with `jaximp demo`, then write a job file for your own recording: `jaximp check JOB.toml` looks at the data "
+    "and proposes filters and a window, `jaximp identify JOB.toml --out DIR` writes estimates and a report.",
+)
+console = Console(stderr=True, highlight=False)
+
+JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to identify, from which recording.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write; it must not exist yet.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a folder that jaximp wrote earlier.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the simulated noise.")]
+
+
+class What(StrEnum):
+    """What can be simulated."""
+
+    rig = "rig"
+
+
+class Holding(StrEnum):
+    """What holds the handle of the simulated rig."""
+
+    spring = "spring"
+    bands = "bands"
+
+
+class Paper(StrEnum):
+    """What can be reproduced."""
+
+    tout2023 = "tout2023"
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one line and exit status 1."""
+    try:
+        app()
+    except (ValueError, OSError) as error:
+        message = " ".join(str(error).split())
+        console.print("[bold red]error:[/] ", end="")
+        console.print(message, markup=False, soft_wrap=True)
+        sys.exit(1)
+
+
+@app.callback()
+def prepare() -> None:
+    """Identification needs float64; compiled code is kept for the next run."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaximp"
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+
+
+@app.command()
+def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
+    """Estimate the parameters in every window of a recording.
+
+    Writes estimates.parquet (one row per window), summary.json, report.html and the figures into the folder.
+    """
+    from jaximp.job import read_job
+
+    _run_job(read_job(job_file), out, force)
+
+
+@app.command()
+def demo(
+    out: Out = Path("jaximp-demo"),
+    force: Force = False,
+    seed: Seed = 0,
+) -> None:
+    """Identify a stiffness that doubles, on a simulated rig, and write the report."""
+    from jaximp.job import read_job
+    from jaximp.outputs import new_folder
+    from jaximp.studies.rig_recordings import write_rig_recordings
+
+    with new_folder(out, force) as folder:
+        write_rig_recordings(folder, "spring", seed)
+        _identify_into(read_job(folder / "job.toml"), folder)
+    _say_where(out)
+
+
+@app.command()
+def check(job_file: JobFile) -> None:
+    """Look at a recording before a run: sampling, gaps, saturation, noise, delay, excitation.
+
+    Proposes cut-off frequencies and a window for the job file.
+    """
+    from jaximp.check import check_recording
+    from jaximp.job import read_job
+
+    job = read_job(job_file)
+    with _progress("checking") as progress:
+        findings, proposal = check_recording(job, job.load(), job.load_robot_alone(), progress)
+    table = Table("", "checked", "found", box=None, pad_edge=False)
+    colour = {"ok": "green", "look": "yellow", "bad": "red"}
+    for finding in findings:
+        table.add_row(f"[{colour[finding.verdict]}]{finding.verdict}[/]", finding.topic, finding.text)
+    Console().print(table)
+    window = "" if proposal.window is None else f"\n[window]\nlength = {proposal.window:g}"
+    typer.echo(
+        f"\n# proposed: {proposal.why}\n[filter]\nposition_cutoff = {proposal.position_cutoff:g}\n"
+        f"decimation_cutoff = {proposal.decimation_cutoff:g}{window}"
+    )
+
+
+@app.command()
+def simulate(
+    what: What,
+    out: Out,
+    force: Force = False,
+    holding: Annotated[Holding, typer.Option("--holding", help="What holds the handle.")] = Holding.spring,
+    seed: Seed = 0,
+) -> None:
+    """Write recordings of a simulated rig, alone and held, with a job file that `identify` reads."""
+    from jaximp.outputs import new_folder
+    from jaximp.studies.rig_recordings import write_rig_recordings
+
+    with new_folder(out, force) as folder:
+        write_rig_recordings(folder, holding.value, seed)
+    typer.echo(f"recordings and job: {out}\nnext: jaximp identify {out / 'job.toml'} --out {out.name}-results")
+
+
+@app.command()
+def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
+    """Redraw a paper's figures and tables; tables.json holds the numbers beside the paper's."""
+    from jaximp.outputs import new_folder
+    from jaximp.studies import tout2023
+
+    with new_folder(out, force) as folder, _progress(f"reproducing {paper.value}") as progress:
+        tout2023.reproduce(folder, progress)
+    typer.echo(f"figures and tables: {out}")
+
+
+def _run_job(job, out: Path, force: bool) -> None:  # type: ignore[no-untyped-def]
+    from jaximp.outputs import new_folder
+
+    with new_folder(out, force) as folder:
+        _identify_into(job, folder)
+    _say_where(out)
+
+
+def _identify_into(job, folder: Path) -> None:  # type: ignore[no-untyped-def]
+    from jaximp.identify import at_other_lengths, identify_recording
+    from jaximp.report import write_results
+
+    with _progress("identifying") as progress:
+        recording, alone = job.load(), job.load_robot_alone()
+        progress(0.1)
+        estimates = identify_recording(job, recording, alone, lambda share: progress(0.1 + 0.4 * share))
+        others = at_other_lengths(job, recording, alone, lambda share: progress(0.5 + 0.3 * share))
+        write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
+        progress(1.0)
+    counts = {name: count for name, count in estimates[0].verdicts.counts().items() if count}
+    typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+def _say_where(out: Path) -> None:
+    typer.echo(f"report: {(out / 'report.html').resolve()}")
+
+
+@contextmanager
+def _progress(task: str) -> Iterator[Progress]:
+    """A bar on the terminal, nothing where there is none."""
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        name = bar.add_task(task, total=1.0)
+        yield lambda share: bar.update(name, completed=share)

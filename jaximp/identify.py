@@ -1,0 +1,290 @@
+"""The job itself: recording + model + filters + windows -> estimates with a verdict each.
+
+`identify` and everything that runs it for many recordings share this module; it reads and writes no files.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp import signals
+from jaximp.job import Job
+from jaximp.least_squares import WindowFit
+from jaximp.models import HumanJoint, Model, combine
+from jaximp.payload import METHODS, Regression, fit_robot, separate
+from jaximp.regression import (
+    Filters,
+    Placement,
+    Rows,
+    column_noise,
+    design_filters,
+    jumped,
+    noise_of_rows,
+    regress,
+    step_seconds,
+    windows_in_rows,
+)
+from jaximp.trust import Verdicts, fake_change_threshold, judge
+from jaximp.types import Progress, Recording
+from jaximp.windows import SlidingFit, held_out_vaf, sliding_least_squares
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """One model in all windows of one recording."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    window: float
+    """Length of the windows [s]."""
+    start: NDArray[np.float64]
+    """(M,) time of each window's first sample [s]."""
+    end: NDArray[np.float64]
+    """(M,) time of each window's last sample [s]."""
+    fit: SlidingFit
+    """Parameters, standard errors and condition of every window."""
+    held_out_vaf: NDArray[np.float64]
+    """(M,) how well each window's parameters predict the torque of the window after it."""
+    verdicts: Verdicts
+    threshold: float | None
+    """Threshold on the condition number, eq. (16), where a reference trajectory was given."""
+    time: NDArray[np.float64]
+    """(N,) time of the torque samples below [s]."""
+    torque: NDArray[np.float64]
+    """(N, n) torque that the model had to explain, filtered [N m]; NaN where it did not count."""
+    reconstructed: NDArray[np.float64]
+    """(N, n) the model's torque with the parameters of the window around each sample."""
+    predicted: NDArray[np.float64]
+    """(N, n) the model's torque with the parameters of the last window that had not seen the sample."""
+    method: int | None = None
+    """Which of the four methods told the human from the robot."""
+    robot: WindowFit | None = None
+    """The robot's parameters, where a method needed them."""
+    robot_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What a reader must know of these numbers, in plain words."""
+
+    def mean_over_trusted(self) -> NDArray[np.float64]:
+        """(p,) mean of each parameter over the trusted windows; NaN if there are none."""
+        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
+        return theta.mean(axis=0) if len(theta) else np.full(len(self.names), np.nan)
+
+
+def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates]:
+    """Run a job: one `Estimates` per method (a job without a robot beside the human has one).
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    return identify_recording(job, job.load(), job.load_robot_alone(), progress)
+
+
+def identify_recording(
+    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+) -> list[Estimates]:
+    """As `identify`, for recordings that are in memory."""
+    signals.require_float64(recording.position)
+    robot, human = job.models(recording.joints)
+    if robot is not None and human is not None:
+        return _identify_human(job, recording, alone, robot, human, progress)
+    model = robot if human is None else human
+    assert model is not None
+    filters = design_filters(job.filter, recording.sample_rate)
+    rows = regress(model, recording, job, filters)
+    place = windows_in_rows(job, recording, rows, filters)
+    noise = noise_of_rows(job, recording, filters)
+    valid = jnp.asarray(rows.valid)
+    fit = sliding_least_squares(rows.W, rows.torque, place.window, place.step, valid=valid, noise=noise)
+    progress(0.7)
+    return [_estimates(job, recording, filters, model, rows, fit, place)]
+
+
+def regress_both(
+    robot: Model, human: Model, recording: Recording, job: Job, filters: Filters
+) -> tuple[Regression, Rows]:
+    """Rows of the robot's and of the human's model for one recording, apart and stacked."""
+    rows = regress(robot + human, recording, job, filters)
+    n = len(robot.names)
+    return Regression(rows.W[:, :n], rows.W[:, n:], rows.torque, jnp.asarray(rows.valid)), rows
+
+
+def _identify_human(
+    job: Job, recording: Recording, alone: Recording | None, robot: Model, human: Model, progress: Progress
+) -> list[Estimates]:
+    """The human in the robot, by every method that the job asks for."""
+    alone = _checked_pair(recording, alone)
+    filters = design_filters(job.filter, recording.sample_rate)
+    # The robot's own parameters come from its whole recording, which needs no windows.
+    once = replace(job, filter=replace(job.filter, mode="once"))
+    whole = regress_both(robot, human, alone, once, filters)[0]
+    robot_fit = fit_robot(whole, noise_of_rows(once, alone, filters))
+    in_windows = whole if job.filter.mode == "once" else regress_both(robot, human, alone, job, filters)[0]
+    loaded, rows = regress_both(robot, human, recording, job, filters)
+    place = windows_in_rows(job, recording, rows, filters)
+    noise, merge = noise_of_rows(job, recording, filters), combine(robot, human).merge
+    results = []
+    for count, method in enumerate(job.model.methods):
+        found = separate(method, robot_fit, in_windows, loaded, merge, place.window, place.step, noise)
+        n = len(found.torque)
+        part = Rows(loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
+        notes = METHODS[method], found.warning
+        estimates = _estimates(job, recording, filters, human, part, found.fit, place, *notes)
+        results.append(replace(estimates, method=method, robot=robot_fit, robot_names=robot.names))
+        progress((count + 1) / len(job.model.methods))
+    return results
+
+
+def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
+    if alone is None:
+        raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
+    if recording.n_joints != 1 or alone.n_joints != 1:
+        raise ValueError("methods 1 to 4 work on one joint at a time: map one position and one torque column")
+    if abs(alone.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+        raise ValueError(
+            f"the robot alone was sampled at {alone.sample_rate:g} Hz and the robot with the human at "
+            f"{recording.sample_rate:g} Hz: resample one of them"
+        )
+    return alone
+
+
+def _estimates(
+    job: Job,
+    recording: Recording,
+    filters: Filters,
+    model: Model,
+    rows: Rows,
+    fit: SlidingFit,
+    place: Placement,
+    *notes: str,
+) -> Estimates:
+    """Judge the windows of a fit and predict what they have not seen."""
+    starts, ahead = place.starts[: len(fit.last)], jnp.asarray(place.next_starts[: len(fit.last)])
+    held_out = held_out_vaf(rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta, ahead, place.window)
+    threshold, why_not = _threshold(job, recording, model)
+    verdicts = judge(
+        fit,
+        model.names,
+        place.counted * recording.n_joints,
+        _parameter_scale(rows),
+        column_noise(model, recording, job, filters, rows),
+        threshold,
+        job.trust,
+    )
+    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place)
+    measured = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
+    return Estimates(
+        names=model.names,
+        units=model.units,
+        window=job.window.length,
+        start=rows.time[starts],
+        end=rows.time[np.asarray(fit.last)],
+        fit=fit,
+        held_out_vaf=np.asarray(held_out),
+        verdicts=verdicts,
+        threshold=threshold,
+        time=rows.time[shown],
+        torque=measured.reshape(len(shown), -1),
+        reconstructed=reconstructed,
+        predicted=predicted,
+        notes=(*recording.notes, *filter(None, (jump_note(recording), _literal_note(job), why_not, *notes))),
+    )
+
+
+def jump_note(recording: Recording) -> str:
+    """Where the position jumps, for people; empty where it does not."""
+    at = recording.time[jumped(recording)]
+    if not len(at):
+        return ""
+    where = ", ".join(f"{t:.6g} s" for t in at[::2][:5]) + (", ..." if len(at) > 10 else "")
+    return f"the position jumps ({where}), as no joint can move: the samples around that are left out"
+
+
+def _literal_note(job: Job) -> str:
+    if job.filter.mode == "once":
+        return ""
+    kept = "are left out" if job.filter.drop_transient else "are kept"
+    return (
+        "the filters ran inside every window, where position and torque do not pass the same filters near the ends: "
+        f"the inertia is biased there (the windows' ends {kept}); filter.mode = 'once' has no such bias"
+    )
+
+
+def _threshold(job: Job, recording: Recording, model: Model) -> tuple[float | None, str]:
+    """Threshold of eq. (16), or why it is not applied."""
+    if recording.reference is None or job.reference_period is None:
+        missing = "reference position" if recording.reference is None else "reference_period"
+        return None, f"no {missing} was given, so the threshold for fake changes (eq. 16) is not applied"
+    rate = recording.sample_rate
+    period = round(job.reference_period * rate)
+    reference = recording.reference[:period]
+    if len(reference) < period or not np.isfinite(reference).all():
+        return None, "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
+    dq, ddq = signals.central_differences(jnp.asarray(reference), rate)
+    motion = tuple(x[:, 0] if recording.n_joints == 1 else x for x in (jnp.asarray(reference), dq, ddq))
+    W = model.observation_matrix(*motion).reshape(-1, len(model.names))
+    return float(fake_change_threshold(W, period, round(job.window.length * rate))), ""
+
+
+def _parameter_scale(rows: Rows) -> NDArray[np.float64]:
+    """(p,) what each parameter would be if its column made all of the torque's variation by itself."""
+    counted = np.asarray(rows.valid)
+    W, torque = np.asarray(rows.W)[counted], np.asarray(rows.torque)[counted]
+    size = np.sqrt((W**2).mean(axis=0))
+    return torque.std() / np.where(size > 0, size, np.inf)
+
+
+def _reconstruct(
+    rows: Rows, fit: SlidingFit, starts: NDArray[np.int64], place: Placement
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """The model's torque with seen and unseen parameters, and which rows it is shown for."""
+    W, theta = np.asarray(rows.W), np.asarray(fit.theta)
+    times, window = rows.time, place.window
+    if place.separate:  # windows hold copies of the same samples: show each sample once, from non-overlapping windows
+        chosen, end = [], -np.inf
+        for k, first in enumerate(starts):
+            if times[first] > end:
+                chosen.append(k)
+                end = times[first + window - 1]
+        shown = np.concatenate([np.arange(starts[k], starts[k] + window) for k in chosen])
+        around = np.repeat(chosen, window)
+        unseen = np.repeat([-1, *chosen[:-1]], window)
+    else:
+        shown = np.arange(len(W))
+        around = np.searchsorted(starts + window / 2, shown).clip(0, len(starts) - 1)
+        unseen = np.searchsorted(starts + window, shown - shown % window, side="right") - 1
+    reconstructed = np.einsum("k...p,kp->k...", W[shown], theta[around])
+    predicted = np.einsum("k...p,kp->k...", W[shown], theta[unseen])
+    predicted[unseen < 0] = np.nan
+    return reconstructed.reshape(len(shown), -1), predicted.reshape(len(shown), -1), shown
+
+
+def equilibrium(estimates: Estimates, human: Model) -> NDArray[np.float64] | None:
+    """(M,) equilibrium position of every window, where the model has an offset."""
+    if not isinstance(human, HumanJoint) or not human.offset:
+        return None
+    return np.asarray(human.equilibrium(jnp.asarray(estimates.fit.theta)))
+
+
+def at_other_lengths(
+    job: Job,
+    recording: Recording,
+    alone: Recording | None = None,
+    progress: Progress = lambda share: None,
+    factors: tuple[float, ...] = (0.5, 2.0),
+) -> list[Estimates]:
+    """The same data with shorter and longer windows, so that the choice of a length can be seen.
+
+    Lengths that the recording or the filters do not allow are left out.
+    """
+    found = []
+    for count, factor in enumerate(factors):
+        window = replace(job.window, length=factor * job.window.length, step=step_seconds(job))
+        methods = replace(job.model, methods=job.model.methods[:1])
+        with suppress(ValueError):
+            found.append(identify_recording(replace(job, window=window, model=methods), recording, alone)[0])
+        progress((count + 1) / len(factors))
+    return found

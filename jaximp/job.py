@@ -1,0 +1,254 @@
+"""The job file: what to identify, from which recording, with which filters and windows.
+
+A job is TOML. `read_job` checks every key and value and names the nearest known key where one is misspelt.
+"""
+
+from __future__ import annotations
+
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from jaximp.models import HumanJoint, Joints, Model, RobotJoint
+from jaximp.payload import METHODS
+from jaximp.recordings import recording_from_mapping
+from jaximp.trust import TrustLimits
+from jaximp.types import Recording, nearest
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Filters of Tout et al. 2023, III-B; all are Butterworth filters run forward and backward."""
+
+    position_cutoff: float | None = None
+    """Low-pass of the position before it is differentiated [Hz]; the paper's f_c, above ten natural frequencies. The
+    torque does not pass it, so whatever it takes off the motion biases the estimates: leave room above the motion."""
+    position_order: int = 8
+    decimation_cutoff: float | None = None
+    """Low-pass of the torque and of every column of the regressor [Hz]; the paper's f_cd, above two natural
+    frequencies."""
+    decimation_order: int = 4
+    high_pass: float | None = None
+    """High-pass of the torque and of every column [Hz], which takes slow drift out of both sides."""
+    high_pass_order: int = 2
+    decimate: int | None = None
+    """Keep every n-th sample after the filters; by default five samples per period of `decimation_cutoff`."""
+    mode: str = "once"
+    """`once` filters the recording and then slides; `window` filters inside every window, as the paper writes."""
+    drop_transient: bool = True
+    """With `mode = "window"`: leave out the rows at both ends of the window that its edges disturb."""
+    measured_derivatives: bool = False
+    """Use the recording's velocity (and acceleration, where it has one) in place of differences of the position."""
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Windows and the samples that count in them."""
+
+    length: float
+    """Length of the sliding window [s]."""
+    step: float | None = None
+    """From one window to the next [s]; by default a fiftieth of the length."""
+    min_velocity: float = 0.0
+    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """Columns of `models.RobotJoint`."""
+
+    gear_ratio: float = 1.0
+    gravity: bool | None = None
+    viscous: bool = True
+    coulomb: bool = True
+    inertia: bool = True
+    offset: bool = False
+    g: float = 9.81
+
+
+@dataclass(frozen=True)
+class HumanSettings:
+    """Columns of `models.HumanJoint`."""
+
+    offset: bool = True
+    gear_ratio: float = 1.0
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """What is identified: a human joint, a robot joint, or the human in the robot by some of the four methods."""
+
+    human: HumanSettings | None = None
+    robot: RobotSettings | None = None
+    methods: tuple[int, ...] = (1,)
+    """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that `identify` needs to know."""
+
+    recording: Mapping[str, Any]
+    """The `[recording]` table: keywords of `load_recording`, and `file`."""
+    model: ModelSettings
+    window: WindowSettings
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    trust: TrustLimits = field(default_factory=TrustLimits)
+    robot_recording: Mapping[str, Any] | None = None
+    """The recording of the robot alone, for the four methods."""
+    reference_period: float | None = None
+    """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
+    folder: Path = Path()
+    """Where relative file names start."""
+    text: str = ""
+    """The job file as written."""
+
+    def load(self) -> Recording:
+        """The recording to be identified."""
+        return recording_from_mapping(self.recording, self.folder)
+
+    def load_robot_alone(self) -> Recording | None:
+        """The recording of the robot alone, where the job has one."""
+        return None if self.robot_recording is None else recording_from_mapping(self.robot_recording, self.folder)
+
+    def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
+        """Robot and human model for a recording with these joints; several joints stand side by side."""
+        robot, human = self.model.robot, self.model.human
+        robots = None if robot is None else [RobotJoint(**vars(robot), joint=joint) for joint in joints]
+        humans = None if human is None else [HumanJoint(**vars(human), joint=joint) for joint in joints]
+        one_or_joints = [
+            None if models is None else models[0] if len(models) == 1 else Joints(*models)
+            for models in (robots, humans)
+        ]
+        return one_or_joints[0], one_or_joints[1]
+
+
+def read_job(path: str | Path) -> Job:
+    """Read and check a job file.
+
+    **Raises:** `ValueError` with one line that names the key and the remedy.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        return parse_job(text, path.parent)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such job file; check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: this is not a TOML file: {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def parse_job(text: str, folder: Path = Path()) -> Job:
+    """A job from TOML text; relative file names start at `folder`."""
+    tables = tomllib.loads(text)
+    known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period"]
+    _check_keys(tables, known, "the job")
+    for required in ("recording", "model", "window"):
+        if required not in tables:
+            raise ValueError(f"the job has no [{required}] table: add one")
+    for table in ("recording", "robot_recording"):
+        if table in tables and not isinstance(tables[table], dict):
+            raise ValueError(f"[{table}] must be a table")
+    job = Job(
+        recording=tables["recording"],
+        robot_recording=tables.get("robot_recording"),
+        model=_model(tables["model"]),
+        window=_settings(WindowSettings, tables["window"], "window"),
+        filter=_settings(FilterSettings, tables.get("filter", {}), "filter"),
+        trust=_settings(TrustLimits, tables.get("trust", {}), "trust"),
+        reference_period=_value(tables.get("reference_period"), float | None, "reference_period"),
+        folder=folder,
+        text=text,
+    )
+    _check_values(job)
+    return job
+
+
+def _model(table: Any) -> ModelSettings:
+    if not isinstance(table, dict):
+        raise ValueError("[model] must be a table")
+    _check_keys(table, ["human", "robot", "methods"], "[model]")
+    robot = _optional(RobotSettings, table.get("robot", False), "model.robot")
+    human = _optional(HumanSettings, table.get("human", False), "model.human")
+    methods = table.get("methods", [1])
+    methods = methods if isinstance(methods, list) else [methods]
+    if not methods or any(type(method) is not int or method not in METHODS for method in methods):
+        raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
+    return ModelSettings(human, robot, tuple(dict.fromkeys(methods)))
+
+
+def _optional(kind: type[T], value: Any, where: str) -> T | None:
+    """`true` is the model as it comes, a table the model with some settings, `false` none."""
+    if value is False:
+        return None
+    return _settings(kind, {} if value is True else value, where)
+
+
+def _check_values(job: Job) -> None:
+    if job.model.human is None and job.model.robot is None:
+        raise ValueError("[model] is empty: write human = true, or robot = true, or both")
+    both = job.model.human is not None and job.model.robot is not None
+    if both and job.robot_recording is None:
+        raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
+    if not both and job.robot_recording is not None:
+        raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
+    if job.filter.mode not in ("once", "window"):
+        raise ValueError(f"filter.mode is '{job.filter.mode}': it must be 'once' or 'window'")
+    positive = {
+        "window.length": job.window.length,
+        "window.step": job.window.step,
+        "filter.decimate": job.filter.decimate,
+        "filter.position_cutoff": job.filter.position_cutoff,
+        "filter.decimation_cutoff": job.filter.decimation_cutoff,
+        "filter.high_pass": job.filter.high_pass,
+        "reference_period": job.reference_period,
+    }
+    for name, value in positive.items():
+        if value is not None and not value > 0:
+            raise ValueError(f"{name} is {value}: it must be above zero")
+    offsets = [part.offset for part in (job.model.human, job.model.robot) if part is not None]
+    if job.filter.high_pass is not None and any(offsets):
+        raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
+
+
+def _settings(kind: type[T], table: Any, where: str) -> T:
+    """Make a dataclass from a TOML table, with every key and type checked."""
+    if not isinstance(table, dict):
+        raise ValueError(f"[{where}] must be a table")
+    hints = typing.get_type_hints(kind)
+    _check_keys(table, list(hints), f"[{where}]")
+    for setting in fields(kind):  # type: ignore[arg-type]
+        if setting.default is MISSING and setting.name not in table:
+            raise ValueError(f"[{where}] has no '{setting.name}': add it")
+    return kind(**{key: _value(value, hints[key], f"{where}.{key}") for key, value in table.items()})
+
+
+def _value(value: Any, hint: Any, where: str) -> Any:
+    """The value with the type that is wanted: whole numbers pass as floats, nothing else is converted."""
+    if typing.get_origin(hint) is tuple:
+        if isinstance(value, list) and all(type(item) is str for item in value):
+            return tuple(value)
+        raise ValueError(f"{where} is {value!r}: it must be a list of names")
+    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for choice in choices:
+        if type(value) is choice:
+            return value
+        if choice is float and type(value) is int:
+            return float(value)
+    expected = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): None}
+    names = " or ".join(name for choice in choices if (name := expected[choice]))
+    raise ValueError(f"{where} is {value!r}: it must be {names}")
+
+
+def _check_keys(table: Mapping[str, Any], known: list[str], where: str) -> None:
+    for key in table:
+        if key not in known:
+            raise ValueError(f"{where} has an unknown key '{key}': {nearest(key, known)}")

@@ -1,0 +1,202 @@
+"""Linear least squares of one window, with what is needed to judge it.
+
+`W` holds one row per sample (or one block of n rows, for n outputs that share the parameters), `y` the torque. The
+window is solved by a QR decomposition, so that its condition number enters once and not squared.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Num, Shaped
+from numpy.typing import NDArray
+
+from jaximp.types import AnyArray
+
+DENSE_ROWS = 512
+"""Up to so many rows the noise's covariance is multiplied as a matrix, beyond by fast Fourier transforms."""
+
+
+class WindowFit(eqx.Module):
+    """The estimate of one window. Where the window has no unique solution everything is NaN, `samples` apart."""
+
+    theta: Float[Array, "*M p"]
+    """Parameters, in the model's units."""
+    covariance: Float[Array, "*M p p"]
+    """Covariance of theta."""
+    dof: Float[Array, "*M"]
+    """Degrees of freedom of the variance estimate: a quantile of Student's t with so many makes the interval."""
+    cond: Float[Array, "*M"]
+    """Condition number of W: largest over smallest singular value."""
+    sigma_min: Float[Array, "*M"]
+    """Smallest singular value of W."""
+    excitation: Float[Array, "*M p"]
+    """Norm of each column's part that the other columns cannot imitate."""
+    residual_rms: Float[Array, "*M"]
+    """Root of the mean squared residual [N m]."""
+    vaf: Float[Array, "*M"]
+    """Variance accounted for, 1 - var(residual)/var(torque): a constant torque earns nothing."""
+    samples: Int[Array, "*M"]
+    """How many torque samples counted."""
+
+    @property
+    def stderr(self) -> Float[Array, "*M p"]:
+        """Standard error of each parameter."""
+        return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+
+def least_squares(
+    W: Num[AnyArray, "S *n p"],
+    y: Num[AnyArray, "S *n"],
+    valid: Shaped[AnyArray, "S *n"] | None = None,
+    noise: Num[AnyArray, " L"] | Num[AnyArray, "S S"] | None = None,
+) -> WindowFit:
+    """Fit `y = W @ theta + noise` over the valid samples of one window.
+
+    **Arguments:** `W` (S, p) or (S, n, p); `y` (S,) or (S, n) [N m]; `valid` False for samples that must not count.
+    `noise` is what is known of the noise: its autocovariance by lag (`signals.autocovariance`), or the covariance
+    matrix of the rows, up to a factor; without it the noise is taken as white.
+
+    **Returns:** a `WindowFit`. White noise gives the textbook standard errors, residual sum of squares over
+    (samples - p). Known noise of covariance s^2 F F' gives `s^2 A F F' A'` with A the pseudo-inverse of W,
+    `s^2 = |r|^2 / tr(G)` with G = M F F' M and M the residual projector, and Satterthwaite's degrees of freedom
+    `tr(G)^2 / tr(G^2)`.
+
+    **Source:** the estimator of Tout et al. 2023, III-B; Satterthwaite 1946 for the degrees of freedom.
+    """
+    n_samples, p = W.shape[0], W.shape[-1]
+    weight = jnp.ones(y.shape, W.dtype) if valid is None else jnp.asarray(valid, W.dtype)
+    W, y = jnp.where(weight[..., None] > 0, W, 0), jnp.where(weight > 0, y, 0)  # whatever a masked sample holds
+    rows, torque, kept = W.reshape(-1, p), y.reshape(-1), weight.reshape(-1)
+    n = kept.sum()
+
+    Q, R, independent = _orthonormal(rows)
+    singular = jnp.linalg.svd(R, compute_uv=False)
+    solvable = (n >= p) & independent
+    inverse = _inverse_of_triangle(jnp.where(solvable, R, jnp.eye(p, dtype=R.dtype)))
+    theta = inverse @ (Q.T @ torque)
+    residual = torque - rows @ theta
+    rss = residual @ residual
+
+    if noise is None:
+        dof = n - p
+        spread = jnp.eye(p, dtype=R.dtype) * rss / jnp.where(dof > 0, dof, jnp.nan)
+    else:
+        spread, dof = _coloured(Q, rss, weight.reshape(n_samples, -1), noise)
+
+    def or_nan(value: Array) -> Array:
+        return jnp.where(solvable, value, jnp.nan)
+
+    return WindowFit(
+        theta=or_nan(theta),
+        covariance=or_nan(inverse @ spread @ inverse.T),
+        dof=or_nan(dof),
+        cond=or_nan(singular[0] / singular[-1]),
+        sigma_min=or_nan(singular[-1]),
+        excitation=or_nan(1 / jnp.linalg.norm(inverse, axis=1)),
+        residual_rms=or_nan(jnp.sqrt(rss / n)),
+        vaf=or_nan(variance_accounted_for(y, y - W @ theta, weight)),
+        samples=n.astype(int),
+    )
+
+
+def variance_accounted_for(
+    torque: Num[AnyArray, "S *n"], residual: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]
+) -> Float[Array, ""]:
+    """1 - var(residual)/var(torque) over the samples that count, means taken output by output."""
+
+    def scatter(x: AnyArray) -> Array:
+        count = jnp.maximum(weight.sum(axis=0), 1)
+        x = jnp.where(weight > 0, x, 0)
+        return (weight * (x - x.sum(axis=0) / count) ** 2).sum()
+
+    return 1 - scatter(residual) / scatter(torque)
+
+
+def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:
+    """Refuse numbers that are not finite where `valid` does not exclude them; while tracing nothing is known yet."""
+    if any(isinstance(array, jax.core.Tracer) for array in (W, y, valid)):
+        return
+    bad = int(((~jnp.isfinite(W).all(axis=-1) | ~jnp.isfinite(y)) & valid).sum())
+    if bad:
+        raise ValueError(f"{bad} samples of W or y are not finite: mark them with valid=False, or mend them")
+
+
+def confidence_interval(
+    theta: Num[AnyArray, "*M p"], stderr: Num[AnyArray, "*M p"], dof: Num[AnyArray, "*M"], level: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper end of the interval that holds the truth with probability `level`, from Student's t."""
+    from scipy.stats import t
+
+    half = t.ppf(0.5 + level / 2, np.asarray(dof))[..., None] * np.asarray(stderr)
+    return np.asarray(theta) - half, np.asarray(theta) + half
+
+
+def _orthonormal(rows: Float[Array, "S p"]) -> tuple[Array, Array, Array]:
+    """`Q, R` with rows = Q R by Gram-Schmidt, every column orthogonalised twice, and whether the rank is full.
+
+    Twice is enough for orthogonality to rounding. Products of whole columns vectorise over windows, where batches of
+    small LAPACK calls do not (and several of them at a time can block each other on few cores). A column whose
+    independent part is lost in rounding makes the rank deficient, whatever its unit.
+    """
+    p = rows.shape[1]
+    negligible = rows.shape[0] * jnp.finfo(rows.dtype).eps
+
+    def add_column(j: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        Q, R, independent = state
+        column = rest = rows[:, j]
+        along = jnp.zeros(p, rows.dtype)
+        for _ in range(2):
+            part = Q.T @ rest
+            rest, along = rest - Q @ part, along + part
+        left = jnp.linalg.norm(rest)
+        independent &= left > negligible * jnp.linalg.norm(column)
+        return (
+            Q.at[:, j].set(rest / jnp.where(left > 0, left, 1)),
+            R.at[:, j].set(along.at[j].set(left)),
+            independent,
+        )
+
+    empty = jnp.zeros_like(rows), jnp.zeros((p, p), rows.dtype), jnp.array(True)
+    return jax.lax.fori_loop(0, p, add_column, empty)
+
+
+def _inverse_of_triangle(R: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Back substitution, written so that it vectorises over windows."""
+    p = R.shape[0]
+    unit = jnp.eye(p, dtype=R.dtype)
+
+    def add_row(k: Array, X: Array) -> Array:
+        i = p - 1 - k
+        return X.at[i].set((unit[i] - R[i] @ X) / R[i, i])
+
+    return jax.lax.fori_loop(0, p, add_row, jnp.zeros_like(R))
+
+
+def _coloured(Q: Array, rss: Array, weight: Array, noise: Array) -> tuple[Array, Array]:
+    """Covariance of `Q' y` and degrees of freedom, for noise of known covariance up to its scale."""
+    n_samples, n_outputs = weight.shape
+    p = Q.shape[1]
+    blocks = Q.reshape(n_samples, n_outputs * p)
+    shaped = (_covariance_times(noise, blocks).reshape(n_samples, n_outputs, p) * weight[..., None]).reshape(-1, p)
+    inner = Q.T @ shaped
+    level = noise[0] if noise.ndim == 1 else jnp.diagonal(noise)[:, None]
+    trace = (weight * level).sum() - jnp.trace(inner)
+    squared = (weight * _covariance_times(noise**2, weight)).sum()
+    trace_of_square = squared - 2 * (shaped * shaped).sum() + (inner * inner).sum()
+    return inner * rss / trace, trace**2 / trace_of_square
+
+
+def _covariance_times(noise: Array, x: Float[Array, "S k"]) -> Float[Array, "S k"]:
+    """Multiply by the noise's covariance: a matrix, or the Toeplitz matrix of an autocovariance by lag."""
+    if noise.ndim == 2:
+        return noise @ x
+    n_samples = x.shape[0]
+    lags = jnp.pad(noise[:n_samples].astype(x.dtype), (0, max(0, n_samples - len(noise))))
+    if n_samples <= DENSE_ROWS:
+        return jax.scipy.linalg.toeplitz(lags) @ x
+    circle = jnp.concatenate([lags, jnp.zeros(1, x.dtype), lags[:0:-1]])
+    spectrum = jnp.fft.rfft(circle)[:, None] * jnp.fft.rfft(x, n=2 * n_samples, axis=0)
+    return jnp.fft.irfft(spectrum, n=2 * n_samples, axis=0)[:n_samples]

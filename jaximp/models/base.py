@@ -1,0 +1,162 @@
+"""What every model is: a pure regressor with named parameters, `torque = regressor(q, dq, ddq) @ theta`."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Num
+
+
+class Model(eqx.Module):
+    """A model that is linear in its parameters.
+
+    A subclass sets the attributes below and writes `row` for **one** sample; batches and whole recordings follow.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    """Name of each parameter, in the order of the columns."""
+    units: tuple[str, ...] = eqx.field(static=True)
+    """SI unit of each parameter."""
+    columns: tuple[str, ...] = eqx.field(static=True)
+    """What each column is made of, such as `ddq` or `sin(q/15)`: equal text means equal numbers."""
+    label: str = eqx.field(static=True)
+    """What goes in front of the names when models are stacked, such as `robot`."""
+    n_joints: int = eqx.field(static=True)
+    """How many joints the regressor has rows for."""
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Regressor of one sample: `(p,)` for one joint, `(n, p)` for several."""
+        raise TypeError(f"{type(self).__name__} has no regressor")
+
+    def regressor(
+        self, q: Num[ArrayLike, "..."], dq: Num[ArrayLike, "..."], ddq: Num[ArrayLike, "..."]
+    ) -> Float[Array, "... p"]:
+        """Regressor `w` with `torque = w @ theta`, for one sample or any batch of samples.
+
+        **Arguments:** joint position `q` [rad or m], velocity `dq`, acceleration `ddq`, all of one shape: `(...)` for
+        a model of one joint, `(..., n)` for n joints.
+
+        **Returns:** `(..., p)` for one joint, `(..., n, p)` for n joints; the units of the columns are those that
+        make `units` come out.
+        """
+        q, dq, ddq = jnp.asarray(q), jnp.asarray(dq), jnp.asarray(ddq)
+        if not q.shape == dq.shape == ddq.shape:
+            raise ValueError(
+                f"position {q.shape}, velocity {dq.shape} and acceleration {ddq.shape} differ in shape: pass one of "
+                "each for every sample"
+            )
+        n_batch = q.ndim - (self.n_joints > 1)
+        if self.n_joints > 1 and (q.ndim == 0 or q.shape[-1] != self.n_joints):
+            raise ValueError(f"the model has {self.n_joints} joints, but the last axis of the position is {q.shape}")
+        function = self.row
+        for _ in range(n_batch):
+            function = jax.vmap(function)
+        return function(q, dq, ddq)
+
+    def observation_matrix(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
+    ) -> Float[Array, "N *n p"]:
+        """Regressor of every sample of a recording; models with memory override it."""
+        return self.regressor(q, dq, ddq)
+
+    def torque(
+        self,
+        theta: Num[ArrayLike, " p"],
+        q: Num[ArrayLike, "..."],
+        dq: Num[ArrayLike, "..."],
+        ddq: Num[ArrayLike, "..."],
+    ) -> Float[Array, "..."]:
+        """Torque [N m] (force [N] for prismatic joints) that the parameters `theta` give."""
+        return self.regressor(q, dq, ddq) @ theta
+
+    def __add__(self, other: Model) -> Model:
+        return Stacked(self, other)
+
+    def _prefixed(self) -> tuple[str, ...]:
+        return tuple(f"{self.label}.{name}" if self.label else name for name in self.names)
+
+
+class Stacked(Model):
+    """Two models that share the motion and add their torques: Tout et al. 2023, eq. (10)."""
+
+    first: Model
+    second: Model
+
+    def __init__(self, first: Model, second: Model):
+        _check_joints(first, second)
+        self.first, self.second = first, second
+        self.names = first._prefixed() + second._prefixed()
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(
+                f"both models are called '{first.label}': stack two different things, such as robot + human"
+            )
+        self.units = first.units + second.units
+        self.columns = first.columns + second.columns
+        self.label = ""
+        self.n_joints = first.n_joints
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        return jnp.concatenate([self.first.row(q, dq, ddq), self.second.row(q, dq, ddq)], axis=-1)
+
+
+class Combined(Model):
+    """Two models whose equal columns are merged, so that all parameters can be told apart: eq. (11).
+
+    `merge` (p, p_first + p_second) of zeros and ones maps the parameters of both onto the merged ones,
+    `theta = merge @ concatenate([theta_first, theta_second])`.
+    """
+
+    first: Model
+    second: Model
+    merge: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+    def __init__(self, first: Model, second: Model):
+        stacked = Stacked(first, second)
+        self.first, self.second = first, second
+        kept = list(dict.fromkeys(stacked.columns))
+        self.columns = tuple(kept)
+        self.merge = tuple(tuple(float(column == other) for other in stacked.columns) for column in kept)
+        members = [[i for i, other in enumerate(stacked.columns) if other == column] for column in kept]
+        self.names = tuple("+".join(stacked.names[i] for i in group) for group in members)
+        self.units = tuple(stacked.units[group[0]] for group in members)
+        self.label = ""
+        self.n_joints = first.n_joints
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        both = Stacked(self.first, self.second)
+        keep = jnp.array([both.columns.index(column) for column in self.columns])
+        return both.row(q, dq, ddq)[..., keep]
+
+
+class Joints(Model):
+    """Independent joints side by side: the regressors stack on the diagonal, joint after joint."""
+
+    models: tuple[Model, ...]
+
+    def __init__(self, *models: Model):
+        if not models or any(model.n_joints != 1 for model in models):
+            raise ValueError("Joints needs one model of one joint for each joint")
+        self.models = models
+        tagged = [(f"joint{i + 1}.", model) for i, model in enumerate(models)]
+        self.names = tuple(tag + name for tag, model in tagged for name in model.names)
+        self.units = tuple(unit for model in models for unit in model.units)
+        self.columns = tuple(tag + column for tag, model in tagged for column in model.columns)
+        self.label = models[0].label
+        self.n_joints = len(models)
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        if self.n_joints == 1:
+            return self.models[0].row(q, dq, ddq)
+        rows = [model.row(q[i], dq[i], ddq[i]) for i, model in enumerate(self.models)]
+        return jax.scipy.linalg.block_diag(*[row[None, :] for row in rows])
+
+
+def combine(first: Model, second: Model) -> Combined:
+    """Stack two models and merge the columns they share: Tout et al. 2023, eq. (11)."""
+    return Combined(first, second)
+
+
+def _check_joints(first: Model, second: Model) -> None:
+    if first.n_joints != second.n_joints:
+        raise ValueError(f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked")

@@ -1,0 +1,149 @@
+"""One joint: the robot that drives it and the human in it. Tout et al. 2023, eqs. (6), (7), (18) to (20)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+from jaximp.models.base import Model
+from jaximp.types import AnyArray
+
+_REVOLUTE = {
+    "inertia": "kg m^2",
+    "damping": "N m s/rad",
+    "stiffness": "N m/rad",
+    "offset_torque": "N m",
+    "viscous_friction": "N m s/rad",
+    "coulomb_friction": "N m",
+    "gravity_x": "kg m",
+    "gravity_y": "kg m",
+}
+_PRISMATIC = {
+    "inertia": "kg",
+    "damping": "N s/m",
+    "stiffness": "N/m",
+    "offset_torque": "N",
+    "viscous_friction": "N s/m",
+    "coulomb_friction": "N",
+}
+
+
+def parameter_units(joint: str) -> dict[str, str]:
+    """Unit of every parameter that a model of one `revolute` or `prismatic` joint can have."""
+    if joint not in ("revolute", "prismatic"):
+        raise ValueError(f"joint is '{joint}': it must be 'revolute' or 'prismatic'")
+    return _REVOLUTE if joint == "revolute" else _PRISMATIC
+
+
+class HumanJoint(Model):
+    """Inertia, damping, stiffness and the torque at angle zero: eqs. (6), (7) of Tout et al. 2023.
+
+    `torque = inertia * ddq + damping * dq + stiffness * q + offset_torque`, with
+    `offset_torque = -stiffness * equilibrium`, which is minus the paper's Gamma_0.
+
+    **Arguments:** `offset` adds the last column (eq. 7). `gear_ratio` N1 other than one says that position and torque
+    are those of the motor (eqs. 19, 20); `at_joint` then gives the parameters of the joint itself. `joint` is
+    `revolute` or `prismatic`.
+    """
+
+    gear_ratio: float
+    offset: bool = eqx.field(static=True)
+
+    def __init__(self, offset: bool = True, gear_ratio: float = 1.0, joint: str = "revolute"):
+        unit = parameter_units(joint)
+        self.gear_ratio = _positive(gear_ratio)
+        self.offset = offset
+        self.names = ("inertia", "damping", "stiffness") + ("offset_torque",) * offset
+        self.units = tuple(unit[name] for name in self.names)
+        self.columns = ("ddq", "dq", "q") + ("1",) * offset
+        self.label = "human"
+        self.n_joints = 1
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        return jnp.stack([ddq, dq, q] + [jnp.ones_like(q)] * self.offset)
+
+    def at_joint(self, theta: Num[AnyArray, "*M p"]) -> Float[Array, "*M p"]:
+        """Parameters on the joint's side of the gear from those on the motor's side.
+
+        With `theta_joint = q/N1` and `torque_joint = N1 * torque`, the inertia, damping and stiffness are N1^2 times
+        those at the motor and the offset torque N1 times. (Eqs. 19, 20; the paper divides the whole vector by N1^2,
+        yet defines the offset as stiffness * N1 * equilibrium, which divides it by N1: the latter is right.)
+        """
+        n = self.gear_ratio
+        return jnp.asarray(theta) * jnp.array([n**2, n**2, n**2] + [n] * self.offset)
+
+    def equilibrium(self, theta: Num[AnyArray, "*M p"]) -> Float[Array, "*M"]:
+        """Position [rad or m] at which the elastic torque vanishes, on the side of the gear that `theta` belongs to."""
+        theta = jnp.asarray(theta)
+        if not self.offset:
+            return jnp.zeros(theta.shape[:-1])
+        return -theta[..., 3] / theta[..., 2]
+
+
+class RobotJoint(Model):
+    """A geared motor with a handle under gravity: eq. (18) of Tout et al. 2023, on the motor's side.
+
+    `torque = gravity_x * g sin(q/N1) + gravity_y * g cos(q/N1) + viscous_friction * dq + coulomb_friction * sign(dq)
+    + inertia * ddq + offset_torque`, each term only where it is asked for.
+
+    **Arguments:** `gear_ratio` N1 is the motor's angle for one radian of the handle; `gravity`, `viscous`, `coulomb`,
+    `inertia`, `offset` choose the columns; `joint` is `revolute` or `prismatic` (which has no gravity columns); `g` is
+    the gravitational acceleration [m/s^2].
+    """
+
+    gear_ratio: float
+    g: float
+    joint: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        gear_ratio: float = 1.0,
+        gravity: bool | None = None,
+        viscous: bool = True,
+        coulomb: bool = True,
+        inertia: bool = True,
+        offset: bool = False,
+        joint: str = "revolute",
+        g: float = 9.81,
+    ):
+        unit = parameter_units(joint)
+        gravity = joint == "revolute" if gravity is None else gravity
+        if gravity and joint == "prismatic":
+            raise ValueError("a prismatic joint has no gravity columns: use offset=True for its constant weight")
+        self.gear_ratio, self.g, self.joint = _positive(gear_ratio), g, joint
+        ratio = f"{self.gear_ratio:g}"
+        chosen = {
+            "gravity_x": (gravity, f"{g:g} sin(q/{ratio})"),
+            "gravity_y": (gravity, f"{g:g} cos(q/{ratio})"),
+            "viscous_friction": (viscous, "dq"),
+            "coulomb_friction": (coulomb, "sign(dq)"),
+            "inertia": (inertia, "ddq"),
+            "offset_torque": (offset, "1"),
+        }
+        self.names = tuple(name for name, (wanted, _) in chosen.items() if wanted)
+        if not self.names:
+            raise ValueError("the robot joint has no parameter left: switch at least one column on")
+        self.columns = tuple(column for wanted, column in chosen.values() if wanted)
+        self.units = tuple(unit[name] for name in self.names)
+        self.label = "robot"
+        self.n_joints = 1
+
+    def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        angle = q / self.gear_ratio
+        column = {
+            "gravity_x": self.g * jnp.sin(angle),
+            "gravity_y": self.g * jnp.cos(angle),
+            "viscous_friction": dq,
+            "coulomb_friction": jnp.sign(dq),
+            "inertia": ddq,
+            "offset_torque": jnp.ones_like(q),
+        }
+        return jnp.stack([column[name] for name in self.names])
+
+
+def _positive(gear_ratio: float) -> float:
+    if not (np.isfinite(gear_ratio) and gear_ratio > 0):
+        raise ValueError(f"gear_ratio is {gear_ratio}: it must be a positive number, motor angle over joint angle")
+    return float(gear_ratio)

@@ -1,0 +1,591 @@
+"""Figures of an identification: the only module that draws.
+
+Every function takes results and returns a `Figure` of a printed page's width; `png` renders it. Nothing is kept
+between calls, and the settings of a caller's own matplotlib stay as they are. Long recordings are thinned to
+envelopes, so that a million samples cost as much as a few thousand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from io import BytesIO
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator
+from numpy.typing import NDArray
+
+from jaximp.identify import Estimates
+from jaximp.least_squares import confidence_interval
+from jaximp.models.joint import parameter_units
+from jaximp.payload import METHODS
+from jaximp.trust import FAKE, NO_DATA, POOR, VERDICTS, WEAK
+
+Numbers = NDArray[np.float64]
+P = ParamSpec("P")
+R = TypeVar("R")
+
+WIDTH = 17 / 2.54
+"""Width of every figure [inch]."""
+POINTS = 4000
+"""A line of more points than this is drawn as its envelope."""
+STRETCHES = 1000
+"""Shaded stretches are drawn no finer than this share of the axis."""
+LONG, EXCERPT = 20.0, 5.0
+"""A recording longer than the first is shown as its envelope, beside an excerpt of the second [s]."""
+
+# Okabe and Ito: told apart by every kind of colour vision, and by lightness in print.
+BLACK, BLUE, VERMILLION, GREEN, ORANGE = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00"
+PALE, HATCH = "0.55", "0.75"
+LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (ORANGE, ":"), (BLACK, (0, (5, 1, 1, 1, 1, 1))))
+SHADES = {WEAK: ("0.96", "////"), FAKE: ("0.90", "\\\\\\\\"), POOR: ("0.93", "xxxx"), NO_DATA: ("0.98", "....")}
+"""Grey and hatch of the stretches that must not be believed."""
+
+STYLE: Any = {
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 150,
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.5,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.5,
+    "hatch.linewidth": 0.4,
+}
+
+
+def _styled(function: Callable[P, R]) -> Callable[P, R]:
+    """Run with the style of these figures, and leave the caller's settings alone."""
+
+    @wraps(function)
+    def with_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(STYLE):
+            return function(*args, **kwargs)
+
+    return with_style
+
+
+@_styled
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file.
+
+    Ticks are made while rendering, so that the style is needed here as well. (`savefig` would draw everything twice.)
+    """
+    stream = BytesIO()
+    FigureCanvasAgg(figure).print_png(stream)
+    return stream.getvalue()
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people: `6.33×10⁻⁵` where a computer writes 6.33e-05, and a dash where there is none."""
+    if not np.isfinite(value):
+        return "–"
+    mantissa, _, exponent = f"{value:.{digits}g}".replace("-", "−").partition("e")
+    if not exponent:
+        return mantissa
+    return f"{mantissa}×10{str(int(exponent.replace('−', '-'))).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A parameter as figures and tables call it, such as `offset torque [N m]`."""
+    return f"{words(name)} [{pretty_unit(unit)}]"
+
+
+def words(name: str) -> str:
+    """The name of a parameter without its underscores."""
+    return name.replace("_", " ").replace(".", " ")
+
+
+def pretty_unit(unit: str) -> str:
+    """A unit with its exponents raised."""
+    return unit.replace("^2", "²")
+
+
+def main_parameter(names: Sequence[str]) -> str:
+    """The parameter that stands for all where only one is shown: the stiffness, else the first."""
+    return next((name for name in names if name.endswith("stiffness")), names[0])
+
+
+@_styled
+def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
+    """Every parameter in every window, with its confidence interval of the given level."""
+    n = len(estimates.names)
+    columns = 1 if n <= 4 else 2
+    rows = -(-n // columns)
+    figure = Figure(figsize=(WIDTH, 1.35 * rows + 0.7))
+    panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    for k in range(n):
+        _parameter_panel(panels.flat[k], estimates, k, _limits([estimates], k, level), level)
+        panels.flat[k].set_title(with_unit(estimates.names[k], estimates.units[k]), loc="left")
+        text, color = _mean_over_trusted(estimates, k, brief=columns > 1)
+        panels.flat[k].set_title(text, loc="right", color=color)
+    for panel in panels.flat[n:]:
+        panel.set_visible(False)
+    for panel in panels[-1]:
+        panel.set_xlabel("end of the window [s]")
+    _legend(figure, panels.flat[0], [estimates])
+    return figure
+
+
+@_styled
+def condition_over_time(estimates: Estimates) -> Figure:
+    """How well each window determines its parameters, and how well they explain the torque."""
+    figure = Figure(figsize=(WIDTH, 5.0))
+    condition, smallest, vaf = figure.subplots(3, 1, sharex=True)
+    _line(condition, estimates.end, estimates.fit.cond, color=BLUE)
+    condition.set(ylabel="condition number [1]")
+    _decades(condition, estimates.fit.cond, estimates.threshold)
+    if estimates.threshold is None:
+        _remark(condition, "no threshold: it needs a reference position and its period")
+    else:
+        condition.axhline(estimates.threshold, color=VERMILLION, linestyle=":")
+        _remark(condition, "dotted: threshold for fake changes, eq. (16)")
+    _line(smallest, estimates.end, estimates.fit.sigma_min, color=BLUE)
+    smallest.set(ylabel="smallest singular\nvalue [mixed units]")
+    _decades(smallest, estimates.fit.sigma_min)
+    _line(vaf, estimates.end, estimates.fit.vaf, color=BLUE, label="VAF in the window")
+    _line(vaf, estimates.end, estimates.held_out_vaf, color=VERMILLION, linestyle="--", label="VAF in the next window")
+    lowest = np.nanpercentile(np.append(estimates.held_out_vaf, 0.0), 2)
+    vaf.set(ylabel="variance accounted\nfor [1]", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
+    vaf.set_xlabel("end of the window [s]")
+    for panel in (condition, smallest, vaf):
+        _shade(panel, estimates)
+    figure.align_ylabels()
+    _legend(figure, condition, [estimates], vaf)
+    return figure
+
+
+@_styled
+def torque(estimates: Estimates) -> Figure:
+    """Measured torque against the model's, and what is left: one row per joint, an excerpt beside long recordings."""
+    time, n_joints = estimates.time, estimates.torque.shape[1]
+    long = time[-1] - time[0] > LONG
+    figure = Figure(figsize=(WIDTH, 2.9 * n_joints + 0.5))
+    grid = {"height_ratios": (2, 1) * n_joints, "width_ratios": (1, 1.25)[: 1 + long]}
+    panels = figure.subplots(2 * n_joints, 1 + long, sharex="col", sharey="row", squeeze=False, gridspec_kw=grid)
+    for joint in range(n_joints):
+        upper, lower = panels[2 * joint : 2 * joint + 2]
+        if long:
+            _torque_envelopes(upper[0], lower[0], estimates, joint)
+        _torque_lines(upper[-1], lower[-1], estimates, joint, _excerpt(estimates, joint) if long else slice(None))
+        what, unit = effort(estimates, joint)
+        whose = f"joint {joint + 1}: " if n_joints > 1 else ""
+        upper[0].set_ylabel(f"{whose}{what} [{unit}]")
+        lower[0].set_ylabel(f"residual [{unit}]")
+        _set_torque_limits(upper[0], lower[0], estimates, joint)
+    if long:
+        panels[0, 0].set_title("whole recording, smallest to largest", loc="left")
+        panels[0, 1].set_title(f"{EXCERPT:g} s of it", loc="left")
+    for panel in panels[-1]:
+        panel.set_xlabel("time [s]")
+        panel.margins(x=0)
+    figure.align_ylabels(panels[:, 0])
+    _legend(figure, panels[0, -1], [])
+    return figure
+
+
+@_styled
+def residual_spectrum(estimates: Estimates) -> Figure:
+    """Power spectral density (Welch) of the torque and of the residual, on the longest stretch without a gap."""
+    n_joints = estimates.torque.shape[1]
+    figure = Figure(figsize=(WIDTH, 2.8))
+    panels = figure.subplots(1, n_joints, squeeze=False)[0]
+    for joint, panel in enumerate(panels):
+        unit = effort(estimates, joint)[1]
+        whose = f"joint {joint + 1}: " if n_joints > 1 else ""
+        panel.set(xlabel="frequency [Hz]", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
+        _spectra(panel, estimates, joint)
+    _legend(figure, max(panels, key=lambda panel: len(panel.get_lines())), [])
+    return figure
+
+
+@_styled
+def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -> Figure:
+    """One parameter of the same data at several window lengths, and what each length costs and earns.
+
+    A short window scatters, a long one hides changes: where the spread over the windows is larger than the standard
+    error, the parameter truly changes or the model misses something.
+    """
+    several = sorted(several, key=lambda estimates: estimates.window)
+    k = several[0].names.index(parameter or main_parameter(several[0].names))
+    name, unit = several[0].names[k], several[0].units[k]
+    figure = Figure(figsize=(WIDTH, 4.4))
+    panels = figure.subplot_mosaic([["time", "time"], ["spread", "share"]], height_ratios=(1.1, 1))
+    over_time, spread, share = panels["time"], panels["spread"], panels["share"]
+    for (color, style), estimates in zip(_cycle(LINES, len(several)), several, strict=True):
+        theta = np.where(estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k], np.nan)
+        _line(over_time, estimates.end, theta, color=color, linestyle=style, label=f"window {estimates.window:g} s")
+    whole = min(estimates.end[0] for estimates in several), max(estimates.end[-1] for estimates in several)
+    over_time.set(xlabel="end of the window [s]", xlim=whole if whole[0] < whole[1] else None, ylim=_limits(several, k))
+    over_time.set_title(f"{with_unit(name, unit)}, trusted windows", loc="left")
+    over_time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(several), borderaxespad=0)
+
+    length = np.array([estimates.window for estimates in several])
+    _spread_against_error(spread, length, several, k)
+    _share_and_held_out(share, length, several)
+    for panel in (spread, share):
+        panel.set(xlabel="window length [s]", xticks=length, xticklabels=[f"{value:g}" for value in length])
+        panel.set_xlim(0.9 * length[0], 1.05 * length[-1])
+        panel.legend(loc="best")
+    return figure
+
+
+@_styled
+def methods(several: Sequence[Estimates], parameter: str | None = None) -> Figure:
+    """One parameter by several methods, one panel each, all with the same axes."""
+    k = several[0].names.index(parameter or main_parameter(several[0].names))
+    figure = Figure(figsize=(WIDTH, 1.45 * len(several) + 0.7))
+    panels = figure.subplots(len(several), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    limits = _limits(several, k)
+    for panel, estimates in zip(panels, several, strict=True):
+        _parameter_panel(panel, estimates, k, limits)
+        if estimates.method is not None:
+            panel.set_title(f"method {estimates.method}: {METHODS[estimates.method]}", loc="left")
+        text, color = _mean_over_trusted(estimates, k)
+        _remark(panel, text, color)
+    figure.supylabel(with_unit(several[0].names[k], several[0].units[k]), fontsize=STYLE["axes.labelsize"])
+    panels[-1].set_xlabel("end of the window [s]")
+    _legend(figure, panels[int(np.argmax([x.verdicts.trusted.sum() for x in several]))], several)
+    return figure
+
+
+def _parameter_panel(
+    panel: Axes, estimates: Estimates, k: int, limits: tuple[float, float], level: float = 0.95
+) -> None:
+    """Parameter k over time: trusted windows in colour with their interval, the others pale."""
+    trusted, theta = estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k]
+    low, high = (np.where(trusted, end[:, k], np.nan) for end in _interval(estimates, level))
+    _shade(panel, estimates)
+    if trusted.any():
+        _line(panel, estimates.end, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
+        _band(panel, estimates.end, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
+    if not trusted.all():
+        _line(panel, estimates.end, np.clip(theta, *_beyond(limits)), color=PALE, linewidth=0.7, label="not trusted")
+    panel.set_ylim(limits)
+
+
+def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tuple[str, str]:
+    """What to write beside a parameter's panel, and in which colour."""
+    if not estimates.verdicts.trusted.any():
+        return "none trusted" if brief else "no window can be trusted", VERMILLION
+    return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
+
+
+def _interval(estimates: Estimates, level: float = 0.95) -> tuple[Numbers, Numbers]:
+    fit = estimates.fit
+    return confidence_interval(fit.theta, fit.stderr, fit.dof, level)
+
+
+def _limits(several: Sequence[Estimates], k: int, level: float = 0.95) -> tuple[float, float]:
+    """Range that shows the trusted windows of all: a wild window must not squash the others."""
+    ends = [np.stack(_interval(estimates, level), axis=-1)[:, k] for estimates in several]
+    masks = [estimates.verdicts.trusted for estimates in several]
+    shown = np.concatenate([end[mask] for end, mask in zip(ends, masks, strict=True)]).ravel()
+    share = (0.5, 99.5)
+    if not np.isfinite(shown).any():
+        shown = np.concatenate([np.asarray(estimates.fit.theta)[:, k] for estimates in several])
+        share = (5, 95)
+    shown = shown[np.isfinite(shown)]
+    if not len(shown):
+        return -1.0, 1.0
+    low, high = np.percentile(shown, share)
+    margin = 0.15 * (high - low) or 0.1 * abs(high) or 1.0
+    return float(low - margin), float(high + margin)
+
+
+def _beyond(limits: tuple[float, float]) -> tuple[float, float]:
+    """Far outside of the panel, and yet within what the renderer can count."""
+    span = 100 * (limits[1] - limits[0])
+    return limits[0] - span, limits[1] + span
+
+
+def _shade(panel: Axes, estimates: Estimates) -> None:
+    """Grey and hatch, one kind per verdict, behind the windows that are not trusted."""
+    is_verdict = estimates.verdicts.verdict[:, None] == np.array(VERDICTS)
+    first = _bins(len(is_verdict), STRETCHES)
+    verdict = np.add.reduceat(is_verdict.astype(int), first).argmax(axis=1)
+    end = estimates.end
+    half = np.median(np.diff(end)) / 2 if len(end) > 1 else estimates.window / 2
+    border = np.append(end[first] - half, end[-1] + half)
+    for kind, (grey, hatch) in SHADES.items():
+        mask = np.concatenate([[False], verdict == VERDICTS.index(kind), [False]])
+        change = np.flatnonzero(mask[1:] != mask[:-1])
+        if len(change):
+            left, right = border[change[::2]], border[change[1::2]]
+            panel.broken_barh(
+                np.column_stack([left, right - left]),  # type: ignore[arg-type]
+                (0, 1),
+                transform=panel.get_xaxis_transform(),
+                facecolor=grey,
+                edgecolor=HATCH,
+                linewidth=0,
+                hatch=hatch,
+                zorder=0,
+            )
+    panel.set_xlim(border[0], border[-1])
+
+
+def _legend(figure: Figure, panel: Axes, several: Sequence[Estimates], *others: Axes) -> None:
+    """What lines and shades mean, below the panels."""
+    handles: list[Artist] = []
+    labels: list[str] = []
+    for source in (panel, *others):
+        found = source.get_legend_handles_labels()
+        handles += found[0]
+        labels += found[1]
+    seen = {verdict for estimates in several for verdict in np.unique(estimates.verdicts.verdict).tolist()}
+    for verdict, (grey, hatch) in SHADES.items():
+        if verdict in seen:
+            handles.append(Patch(facecolor=grey, edgecolor=HATCH, linewidth=0, hatch=hatch))
+            labels.append(verdict)
+    one_row = sum(8 + len(label) for label in labels) < 110
+    columns = len(labels) if one_row else -(-len(labels) // 2)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.5)
+
+
+def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, part: slice) -> None:
+    time, measured = estimates.time[part], estimates.torque[part, joint]
+    seen, unseen = estimates.reconstructed[part, joint], estimates.predicted[part, joint]
+    far = _beyond(_torque_limits(estimates, joint))
+    _line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
+    _line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label="model, fitted")
+    _line(
+        upper,
+        time,
+        np.clip(unseen, *far),
+        color=VERMILLION,
+        linestyle="--",
+        linewidth=0.9,
+        label="model, held out (window before)",
+    )
+    _line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
+    _line(lower, time, np.clip(measured - unseen, *far), color=VERMILLION, linestyle="--", linewidth=0.9)
+
+
+def _torque_envelopes(upper: Axes, lower: Axes, estimates: Estimates, joint: int) -> None:
+    """Smallest and largest value in every hundredth of the recording: areas for what was measured, and is left."""
+    measured = estimates.torque[:, joint]
+    first = _bins(len(measured), 100)
+    time = estimates.time[first]
+    far = _beyond(_torque_limits(estimates, joint))
+
+    def ends(values: Numbers) -> tuple[Numbers, Numbers]:
+        values = np.clip(np.where(np.isfinite(measured), values, np.nan), *far)
+        return np.fmin.reduceat(values, first), np.fmax.reduceat(values, first)
+
+    upper.fill_between(time, *ends(measured), color="0.8", linewidth=0)
+    for end in ends(estimates.reconstructed[:, joint]):
+        upper.plot(time, end, color=BLUE, linewidth=0.8)
+    lower.fill_between(time, *ends(measured - estimates.reconstructed[:, joint]), color=BLUE, alpha=0.4, linewidth=0)
+    for end in ends(measured - estimates.predicted[:, joint]):
+        lower.plot(time, end, color=VERMILLION, linestyle="--", linewidth=0.8)
+
+
+def _torque_limits(estimates: Estimates, joint: int) -> tuple[float, float]:
+    measured = estimates.torque[:, joint]
+    measured = measured[np.isfinite(measured)]
+    if not len(measured):
+        return -1.0, 1.0
+    low, high = float(measured.min()), float(measured.max())
+    margin = 0.1 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _set_torque_limits(upper: Axes, lower: Axes, estimates: Estimates, joint: int) -> None:
+    """Both panels in the scale of the measured torque: a model that runs away leaves the panel."""
+    limits = _torque_limits(estimates, joint)
+    upper.set_ylim(limits)
+    measured = estimates.torque[:, joint]
+    residual = np.abs(np.concatenate([measured - x[:, joint] for x in (estimates.reconstructed, estimates.predicted)]))
+    residual = residual[np.isfinite(residual)]
+    largest = float(np.percentile(residual, 99.9)) if len(residual) else 1.0
+    half = min(1.2 * largest or 1.0, limits[1] - limits[0])
+    lower.set_ylim(-half, half)
+
+
+def _excerpt(estimates: Estimates, joint: int) -> slice:
+    """The few seconds with the most samples that count and are predicted; of equals, those nearest to the middle."""
+    time = estimates.time
+    usable = np.isfinite(estimates.torque[:, joint]) & np.isfinite(estimates.predicted[:, joint])
+    count = np.concatenate([[0], np.cumsum(usable)])
+    stop = np.searchsorted(time, time + EXCERPT)
+    full = np.flatnonzero(time + EXCERPT <= time[-1])
+    found = (count[stop] - count[:-1])[full]
+    best = full[found == found.max()]
+    first = int(best[np.abs(time[best] + EXCERPT / 2 - (time[0] + time[-1]) / 2).argmin()])
+    return slice(first, int(stop[first]))
+
+
+def _longest_stretch(estimates: Estimates, joint: int) -> tuple[list[Numbers], float]:
+    """Torque and residuals on the longest run of samples without a gap, and their sample rate [Hz].
+
+    The held-out residual is left out where there is none.
+    """
+    time, measured = estimates.time, estimates.torque[:, joint]
+    fitted, held_out = measured - estimates.reconstructed[:, joint], measured - estimates.predicted[:, joint]
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    for signals in ([measured, fitted, held_out], [measured, fitted]):
+        counts = np.isfinite(signals).all(axis=0)
+        # A run ends where a sample is missing, and where the time jumps.
+        run = np.cumsum(~counts | (np.diff(time, prepend=time[0]) > 1.5 * interval))
+        lengths = np.bincount(run[counts], minlength=1)
+        part = counts & (run == lengths.argmax())
+        if part.sum() >= 16:
+            break
+    return [signal[part] for signal in signals], 1 / interval
+
+
+def _spectra(panel: Axes, estimates: Estimates, joint: int) -> None:
+    from scipy.signal import welch
+
+    signals, rate = _longest_stretch(estimates, joint)
+    n = len(signals[0])
+    if n < 16 or np.ptp(signals[0]) == 0:
+        _remark(panel, "no stretch without a gap\nis long enough for a spectrum")
+        panel.set(xticks=(), yticks=())
+        return
+    what = effort(estimates, joint)[0]
+    lines = ((BLACK, "-", what), (BLUE, "-", "residual, fitted"), (VERMILLION, "--", "residual, held out"))
+    spectra = [welch(signal, rate, nperseg=max(16, n // 8)) for signal in signals]
+    for (frequency, power), (color, style, label) in zip(spectra, lines, strict=False):
+        panel.loglog(frequency[1:], power[1:], color=color, linestyle=style, label=label)
+    frequency, power = (x[1:] for x in spectra[0])
+    shown = frequency[power > 1e-6 * power.max()]  # what the filters removed is not worth the ink
+    panel.set(ylim=(power.max() * 1e-6, power.max() * 3), xlim=(frequency[0], max(shown[-1], 2 * frequency[0])))
+    panel.set_title(f"longest stretch without a gap, {n / rate:.3g} s", loc="left")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.minorticks_off()
+
+
+def _spread_against_error(panel: Axes, length: Numbers, several: Sequence[Estimates], k: int) -> None:
+    summary = np.array([_spread_and_error(estimates, k) for estimates in several])
+    panel.plot(length, summary[:, 0], "o-", color=BLUE, label="sd over the windows")
+    panel.plot(length, summary[:, 1], "s--", color=VERMILLION, label="median standard error")
+    panel.set_ylabel(with_unit(several[0].names[k], several[0].units[k]))
+    panel.set_ylim(0, 1.25 * np.fmax.reduce(summary, axis=None, initial=0.0) or 1)
+
+
+def _share_and_held_out(panel: Axes, length: Numbers, several: Sequence[Estimates]) -> None:
+    share = [estimates.verdicts.trusted.mean() for estimates in several]
+    held_out = [_mean(estimates.held_out_vaf[estimates.verdicts.trusted]) for estimates in several]
+    panel.plot(length, share, "o-", color=BLUE, label="trusted")
+    panel.plot(length, held_out, "s--", color=VERMILLION, label="held-out VAF of these")
+    panel.set(ylabel="share of windows, VAF [1]", ylim=(max(-1, np.fmin.reduce(held_out, initial=0.0)) - 0.03, 1.03))
+
+
+def _spread_and_error(estimates: Estimates, k: int) -> tuple[float, float]:
+    """Standard deviation over the trusted windows, and their median standard error."""
+    trusted = estimates.verdicts.trusted
+    theta, stderr = (np.asarray(x)[trusted, k] for x in (estimates.fit.theta, estimates.fit.stderr))
+    return (float(theta.std()), float(np.median(stderr))) if len(theta) else (np.nan, np.nan)
+
+
+def effort(estimates: Estimates, joint: int) -> tuple[str, str]:
+    """Whether the joint has a torque or a force, told by the units of its parameters."""
+    own = f"joint{joint + 1}."
+    units = {u for name, u in zip(estimates.names, estimates.units, strict=True) if not name.startswith("joint")}
+    units |= {u for name, u in zip(estimates.names, estimates.units, strict=True) if name.startswith(own)}
+    return ("force", "N") if units <= set(parameter_units("prismatic").values()) else ("torque", "N m")
+
+
+def _line(panel: Axes, x: Numbers, y: Any, **style: Any) -> None:
+    """A line, thinned where it is long; the small dots show windows that stand alone."""
+    x, y = np.asarray(x), np.asarray(y, float)
+    if len(x) > POINTS:
+        first = _bins(len(x), POINTS // 2)
+        x = np.repeat(x[first], 2)
+        y = np.column_stack([np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)]).ravel()
+    alone = len(x) <= POINTS and bool(_is_alone(y).any())
+    panel.plot(x, y, marker="." if alone else "", markersize=2, **style)
+
+
+def _is_alone(y: Numbers) -> NDArray[np.bool_]:
+    """Points between two gaps, which a line does not show."""
+    counts = np.isfinite(y)
+    return counts & ~np.append(False, counts[:-1]) & ~np.append(counts[1:], False)
+
+
+def _band(panel: Axes, x: Numbers, low: Numbers, high: Numbers, **style: Any) -> None:
+    first = _bins(len(x), POINTS // 2)
+    panel.fill_between(x[first], np.fmin.reduceat(low, first), np.fmax.reduceat(high, first), **style)
+
+
+def _bins(n: int, limit: int) -> NDArray[np.int64]:
+    """First index of each of at most `limit` equal groups of n values."""
+    return np.linspace(0, n, min(n, limit), endpoint=False).astype(np.int64)
+
+
+def _cycle(items: Sequence[R], n: int) -> list[R]:
+    return [items[k % len(items)] for k in range(n)]
+
+
+def _mean(values: Numbers) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _decades(panel: Axes, values: Any, *others: float | None) -> None:
+    """A logarithmic axis over whole decades, so that noise does not look like a change."""
+    shown = np.append(np.asarray(values, float), [other for other in others if other is not None])
+    shown = shown[np.isfinite(shown) & (shown > 0)].clip(1e-16, 1e16)  # beyond, it is rounding
+    panel.set_yscale("log")
+    if len(shown):
+        low, high = np.log10(shown.min()), np.log10(shown.max())
+        panel.set_ylim(10 ** np.floor(low - 0.1), 10 ** np.ceil(high + 0.1))
+    panel.minorticks_off()
+
+
+def _remark(panel: Axes, text: str, color: str = "0.3") -> None:
+    """A few words in the upper left corner, readable on any shade."""
+    frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
+    panel.text(0.01, 0.95, text, transform=panel.transAxes, va="top", color=color, bbox=frame, zorder=5)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A set of curves in one pair of axes."""
+
+    title: str
+    x: str
+    y: str
+    lines: Sequence[tuple[str, Numbers, Numbers]]
+    """Label, x and y of each; the first is drawn in black, as what the others are held against."""
+    limits: tuple[float, float] | None = None
+    log: bool = False
+
+
+@_styled
+def curves(panels: Sequence[Panel]) -> Figure:
+    """Panels one below another, each with its legend beside it."""
+    figure = Figure(figsize=(WIDTH, 2.2 * len(panels) + 0.3))
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        for k, (label, x, y) in enumerate(panel.lines):
+            color, style = (BLACK, "-") if k == 0 else LINES[:4][(k - 1) % 4]
+            _line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if k else 1.3)
+        if panel.limits is not None:
+            axis.set_ylim(*panel.limits)
+        if panel.log:
+            axis.set_yscale("log")
+        axis.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
+        axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure

@@ -1,0 +1,280 @@
+"""From a recording to rows for least squares: filters, derivatives, the model's columns, decimation.
+
+Tout et al. 2023, III-B. The filters run over the recording once, and windows slide over its rows; or, as the paper
+writes, inside every window, whose rows then stand one block after another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from jaximp import signals
+from jaximp.job import FilterSettings, Job
+from jaximp.models import Model
+from jaximp.types import AnyArray, Recording
+from jaximp.windows import map_windows, slice_window, window_starts
+
+LARGEST_BLOCKS = 200_000_000
+"""Numbers that filtering inside every window may keep (1.6 GB)."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Designed filters of one recording."""
+
+    position: signals.Sections | None
+    """Second-order sections that the position passes before it is differentiated."""
+    parallel: signals.Sections | None
+    """Second-order sections that the torque and every column pass."""
+    decimate: int
+    """Every n-th sample is kept."""
+
+    @property
+    def reach(self) -> int:
+        """Samples beside an end or a gap that the filters spoil."""
+        return sum(signals.reach(sos) for sos in (self.position, self.parallel) if sos is not None)
+
+    @property
+    def ringing(self) -> int:
+        """Samples beside a jump of the position until the filters' answer to it has died out."""
+        return sum(signals.reach(sos, 1e-6) for sos in (self.position, self.parallel) if sos is not None)
+
+    @property
+    def noise(self) -> NDArray[np.float64] | None:
+        """Autocovariance by lag, in rows, of white torque noise after the filters."""
+        return None if self.parallel is None else signals.autocovariance(self.parallel, self.decimate)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A filtered recording as least squares sees it; (N, ...) rows after decimation."""
+
+    W: Array
+    torque: Array
+    valid: NDArray[np.bool_]
+    time: NDArray[np.float64]
+
+
+def design_filters(settings: FilterSettings, sample_rate: float) -> Filters:
+    """Butterworth filters for a recording of this sample rate [Hz]."""
+    parallel = [
+        signals.butterworth(order, cutoff, sample_rate, kind)
+        for order, cutoff, kind in (
+            (settings.decimation_order, settings.decimation_cutoff, "lowpass"),
+            (settings.high_pass_order, settings.high_pass, "highpass"),
+        )
+        if cutoff is not None
+    ]
+    decimate = settings.decimate
+    if decimate is None:
+        cutoff = settings.decimation_cutoff
+        decimate = 1 if cutoff is None else max(1, int(sample_rate / (5 * cutoff)))
+    position = None
+    if settings.position_cutoff is not None:
+        position = signals.butterworth(settings.position_order, settings.position_cutoff, sample_rate)
+    return Filters(_plain(position), _plain(np.concatenate(parallel)) if parallel else None, decimate)
+
+
+def _plain(sos: NDArray[np.float64] | None) -> signals.Sections | None:
+    """As plain numbers, which make `Filters` hashable: recordings filtered alike share compiled code."""
+    return None if sos is None else tuple(tuple(section) for section in sos.tolist())
+
+
+def regress(model: Model, recording: Recording, job: Job, filters: Filters) -> Rows:
+    """Filter a recording and evaluate the model on it, once or inside every window, as the job says."""
+    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
+    derivatives = _measured_derivatives(job.filter, recording)
+    if job.filter.mode == "window":
+        return _regress_in_windows(model, recording, job, filters, q, torque)
+    W, y, speed = _filtered(model, filters, recording.sample_rate, q, torque, derivatives)
+    valid = undisturbed(recording, filters)[:: filters.decimate]
+    moving = np.asarray(speed) >= job.window.min_velocity
+    valid = valid & moving if recording.n_joints == 1 else valid[:, None] & moving
+    if not valid.any():
+        raise ValueError(
+            "no sample is left after filtering: the recording is too short for the filters or never moves faster than "
+            "window.min_velocity"
+        )
+    return Rows(W, y, valid, recording.time[:: filters.decimate])
+
+
+def jumped(recording: Recording) -> NDArray[np.bool_]:
+    """(N,) True where the position of some joint jumps."""
+    return np.any([signals.jumps(q) for q in recording.position.T], axis=0)
+
+
+def undisturbed(recording: Recording, filters: Filters) -> NDArray[np.bool_]:
+    """(N,) samples whose filtered value comes from measurements alone, and not from a gap, an end or a jump."""
+    valid = signals.widen_gaps(recording.valid, filters.reach)
+    jumps = jumped(recording)
+    return valid & signals.widen_gaps(~jumps, filters.ringing, ends=False) if jumps.any() else valid
+
+
+@eqx.filter_jit
+def _filtered(
+    model: Model,
+    filters: Filters,
+    sample_rate: float,
+    q: Array | NDArray[np.float64],
+    torque: Array | NDArray[np.float64],
+    derivatives: tuple[NDArray[np.float64] | None, NDArray[np.float64] | None] = (None, None),
+) -> tuple[Array, Array, Array]:
+    """Regressor, torque and speed of one stretch of samples: parallel filters, then every n-th sample."""
+
+    def smooth(x: Array | NDArray[np.float64]) -> Array:
+        return jnp.asarray(x) if filters.position is None else signals.filter_zero_phase(filters.position, x)
+
+    q = smooth(q)
+    dq, ddq = signals.central_differences(q, sample_rate)
+    if derivatives[0] is not None:
+        dq = smooth(derivatives[0])
+        ddq = signals.central_differences(dq, sample_rate)[0]
+    if derivatives[1] is not None:
+        ddq = smooth(derivatives[1])
+    one_joint = q.shape[1] == 1
+    motion = tuple(x[:, 0] if one_joint else x for x in (q, dq, ddq))
+    W = model.observation_matrix(*motion)
+    y = jnp.asarray(torque)[:, 0] if one_joint else jnp.asarray(torque)
+    if filters.parallel is not None:
+        both = jnp.concatenate([W, y[..., None]], axis=-1)
+        both = signals.filter_zero_phase(filters.parallel, both)
+        W, y = both[..., :-1], both[..., -1]
+    n = filters.decimate
+    return W[::n], y[::n], jnp.abs(motion[1])[::n]
+
+
+def _regress_in_windows(
+    model: Model, recording: Recording, job: Job, filters: Filters, q: NDArray[np.float64], torque: NDArray[np.float64]
+) -> Rows:
+    """The paper's letter: every window is filtered by itself. The windows' rows stand one block after another."""
+    rate = recording.sample_rate
+    window = round(job.window.length * rate)
+    starts = window_starts(len(recording), window, round(step_seconds(job) * rate))
+    n_rows = len(range(0, window, filters.decimate))
+    if len(starts) * n_rows * len(model.names) > LARGEST_BLOCKS:
+        raise ValueError(
+            "filtering inside every window makes too many rows here: lengthen window.step or filter.decimate"
+        )
+
+    W, y, speed = _filtered_windows(model, filters, rate, window, jnp.asarray(starts), q, torque)
+    kept = np.arange(0, window, filters.decimate)
+    inside = _away_from_ends(window, filters, job.filter)
+    if inside.sum() * recording.n_joints < len(model.names):
+        raise ValueError(
+            f"windows of {job.window.length:g} s are shorter than the filters' transients at both ends "
+            f"({2 * filters.reach / rate:.2g} s): lengthen them, or set filter.drop_transient = false"
+        )
+    index = starts[:, None] + kept
+    far_from_jumps = signals.widen_gaps(~jumped(recording), filters.ringing, ends=False)
+    valid = (recording.valid & far_from_jumps)[index] & inside
+    moving = np.asarray(speed) >= job.window.min_velocity
+    valid = valid & moving if recording.n_joints == 1 else valid[..., None] & moving
+    W, y = (x.reshape(-1, *x.shape[2:]) for x in (W, y))
+    return Rows(W, y, valid.reshape(-1, *valid.shape[2:]), recording.time[index].ravel())
+
+
+@eqx.filter_jit
+def _filtered_windows(
+    model: Model, filters: Filters, sample_rate: float, window: int, starts: Array, q: AnyArray, torque: AnyArray
+) -> tuple[Array, Array, Array]:
+    """`_filtered` of every window, (M, rows, ...)."""
+
+    def one(start: Array) -> tuple[Array, Array, Array]:
+        q_window, torque_window = slice_window((jnp.asarray(q), jnp.asarray(torque)), start, window)
+        return _filtered(model, filters, sample_rate, q_window, torque_window)
+
+    return map_windows(one, starts, window * len(model.names))
+
+
+def _away_from_ends(window: int, filters: Filters, settings: FilterSettings) -> NDArray[np.bool_]:
+    """Which rows of a window that was filtered by itself count."""
+    kept = np.arange(0, window, filters.decimate)
+    edge = filters.reach if settings.drop_transient else 0
+    return (kept >= edge) & (kept < window - edge)
+
+
+def _measured_derivatives(
+    settings: FilterSettings, recording: Recording
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    if not settings.measured_derivatives:
+        return None, None
+    if recording.velocity is None:
+        raise ValueError("filter.measured_derivatives needs a velocity column in [recording]")
+    if settings.mode == "window":
+        raise ValueError("filter.measured_derivatives works with filter.mode = 'once'")
+    acceleration = recording.acceleration
+    return signals.fill_gaps(recording.velocity, recording.valid), (
+        None if acceleration is None else signals.fill_gaps(acceleration, recording.valid)
+    )
+
+
+def step_seconds(job: Job) -> float:
+    return job.window.length / 50 if job.window.step is None else job.window.step
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where windows lie in the rows: sliding over shared rows, or one block of rows after another."""
+
+    window: int
+    """Rows in a window."""
+    step: int
+    """Rows from one window to the next."""
+    counted: int
+    """Rows of a complete window that count."""
+    starts: NDArray[np.int64]
+    """(M,) first row of each window."""
+    next_starts: NDArray[np.int64]
+    """(M,) first row of the window that follows without overlap."""
+    separate: bool
+
+
+def windows_in_rows(job: Job, recording: Recording, rows: Rows, filters: Filters) -> Placement:
+    """Find the windows of a job in the rows of a recording."""
+    rate = recording.sample_rate
+    if round(job.window.length * rate) > len(recording):
+        raise ValueError(
+            f"the window of {job.window.length:g} s is longer than the recording of {len(recording) / rate:.4g} s: "
+            "shorten window.length"
+        )
+    if job.filter.mode == "window":
+        samples = round(job.window.length * rate)
+        block = len(range(0, samples, filters.decimate))
+        starts = np.arange(0, len(rows.time), block)
+        ahead = -(-samples // round(step_seconds(job) * rate))
+        counted = int(_away_from_ends(samples, filters, job.filter).sum())
+        return Placement(block, block, counted, starts, starts + ahead * block, separate=True)
+    window = round(job.window.length * rate / filters.decimate)
+    step = max(1, round(step_seconds(job) * rate / filters.decimate))
+    starts = window_starts(len(rows.time), window, step)
+    return Placement(window, step, window, starts, starts + window, separate=False)
+
+
+def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | None:
+    """What the filters make of white torque noise: by lag, or for every pair of rows of a window."""
+    if job.filter.mode == "once" or filters.parallel is None:
+        return None if filters.noise is None else jnp.asarray(filters.noise)
+    window = round(job.window.length * recording.sample_rate)
+    response = signals.filter_zero_phase(filters.parallel, jnp.eye(window))[:: filters.decimate]
+    return response @ response.T
+
+
+def column_noise(model: Model, recording: Recording, job: Job, filters: Filters, rows: Rows) -> NDArray[np.float64]:
+    """(p,) root mean square that noise of the position leaves in each column: the pipeline, run on noise as well.
+
+    The columns that jump (the sign of the velocity) are left out: the jumps say nothing of the joint's excitation.
+    """
+    generator = np.random.default_rng(0)
+    noise = np.stack([generator.normal(0, signals.noise_level(q), len(q)) for q in recording.position.T], axis=1)
+    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
+    rate = recording.sample_rate
+    plain, noisy = (np.asarray(_filtered(model, filters, rate, x, torque)[0]) for x in (q, q + noise))
+    difference = (noisy - plain).reshape(-1, len(model.names))
+    smooth = np.array(["sign" not in column for column in model.columns])
+    return np.where(smooth, np.sqrt((difference**2).mean(axis=0)), 0.0)

@@ -1,0 +1,220 @@
+"""Filters and derivatives of sampled signals, differentiable and vmappable; time is axis 0.
+
+scipy designs the filters. Applying them is written here in JAX, with scipy's edge treatment, because a fit that is
+filtered inside every window, and a gradient through a filter, need it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+from numpy.typing import NDArray
+
+from jaximp.types import AnyArray
+
+Sections = NDArray[np.float64] | tuple[tuple[float, ...], ...]
+"""Second-order sections (k, 6): an array, or plain numbers by which compiled code can be found again."""
+
+
+def require_float64(*arrays: object) -> None:
+    """Raise where float64 numbers would silently become float32."""
+    if jax.config.read("jax_enable_x64"):
+        return
+    if any(np.dtype(getattr(array, "dtype", np.float64)) != np.float32 for array in arrays):
+        raise ValueError(
+            "float64 is off, and identification needs it: call jax.config.update('jax_enable_x64', True) before "
+            "the first computation (or pass float32 arrays if you mean it)"
+        )
+
+
+def butterworth(order: int, cutoff: float, sample_rate: float, kind: str = "lowpass") -> NDArray[np.float64]:
+    """Second-order sections (k, 6) of a Butterworth filter of `order` with `cutoff` [Hz]; `lowpass` or `highpass`.
+
+    Applied forward and backward (`filter_zero_phase`) its amplitude at the cut-off is 1/2.
+    """
+    from scipy.signal import butter
+
+    if not (isinstance(order, int | np.integer) and order > 0):
+        raise ValueError(f"the filter's order is {order}: it must be a whole number above zero")
+    if not 0 < cutoff < sample_rate / 2:
+        raise ValueError(
+            f"the {kind} cut-off of {cutoff:g} Hz must lie between 0 and {sample_rate / 2:g} Hz, half the sample rate"
+        )
+    return np.asarray(butter(order, cutoff, kind, fs=sample_rate, output="sos"))
+
+
+def filter_zero_phase(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "N *k"]:
+    """Run the sections forward and backward over axis 0, with an odd extension at both ends.
+
+    The same numbers as `scipy.signal.sosfiltfilt(sos, x, axis=0)`.
+
+    **Raises:** `ValueError` if there are too few samples for the extension.
+    """
+    require_float64(x)
+    x, sos = _floating(x), np.asarray(sos, np.float64)
+    edge = edge_samples(sos)
+    if x.shape[0] <= edge:
+        raise ValueError(
+            f"{x.shape[0]} samples are too few for this filter, which needs more than {edge}: "
+            "use a longer window or recording, or a lower order"
+        )
+    start, end = 2 * x[:1] - x[edge:0:-1], 2 * x[-1:] - x[-2 : -edge - 2 : -1]
+    y = _filter_from_rest(sos, jnp.concatenate([start, x, end]))
+    return _filter_from_rest(sos, y, backward=True)[edge:-edge]
+
+
+def _floating(x: AnyArray) -> Array:
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+
+
+def edge_samples(sos: NDArray[np.float64]) -> int:
+    """How many samples scipy extends a signal by at each end."""
+    taps = 2 * len(sos) + 1 - min(int((sos[:, 2] == 0).sum()), int((sos[:, 5] == 0).sum()))
+    return 3 * taps
+
+
+def _filter_from_rest(sos: NDArray[np.float64], x: Array, backward: bool = False) -> Array:
+    """One pass in either direction, starting as if the sample it meets first had lasted for ever."""
+    from scipy.signal import sosfilt_zi
+
+    return _filter(jnp.asarray(sos, x.dtype), jnp.asarray(sosfilt_zi(sos), x.dtype), x, backward)
+
+
+@partial(jax.jit, static_argnames="backward")
+def _filter(sos: Array, rest: Array, x: Array, backward: bool) -> Array:
+    """Cascade in transposed direct form II; `rest` (k, 2) is the state of a unit input that lasts for ever.
+
+    The coefficients are arguments, so that filters with the same number of sections share their compiled code.
+    """
+
+    def step(state: list[tuple[Array, Array]], value: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        new_state = []
+        for (b0, b1, b2, _, a1, a2), (z1, z2) in zip(sos, state, strict=True):
+            out = b0 * value + z1
+            new_state.append((b1 * value - a1 * out + z2, b2 * value - a2 * out))
+            value = out
+        return new_state, value
+
+    first = x[-1] if backward else x[0]
+    return jax.lax.scan(step, [(z1 * first, z2 * first) for z1, z2 in rest], x, reverse=backward)[1]
+
+
+def central_differences(
+    q: Num[AnyArray, "N *k"], sample_rate: float
+) -> tuple[Float[Array, "N *k"], Float[Array, "N *k"]]:
+    """First and second derivative by central differences; the first and last sample take one-sided ones."""
+    if q.shape[0] < 3:
+        raise ValueError(f"{q.shape[0]} samples have no second difference: at least 3 are needed")
+    dq = (q[2:] - q[:-2]) * (sample_rate / 2)
+    first = (-3 * q[:1] + 4 * q[1:2] - q[2:3]) * (sample_rate / 2)
+    last = (3 * q[-1:] - 4 * q[-2:-1] + q[-3:-2]) * (sample_rate / 2)
+    ddq = (q[2:] - 2 * q[1:-1] + q[:-2]) * sample_rate**2
+    return jnp.concatenate([first, dq, last]), jnp.concatenate([ddq[:1], ddq, ddq[-1:]])
+
+
+def autocovariance(sos: Sections, every: int = 1, tolerance: float = 1e-9) -> NDArray[np.float64]:
+    """Autocovariance of white noise that was filtered to zero phase and then kept every n-th sample, as (L,).
+
+    Lag zero is one. The lags end where they stay below `tolerance`. This is what standard errors need to know of the
+    filter: neighbouring residuals are no longer independent.
+    """
+    density = _zero_phase_gain(sos) ** 2
+    r = np.fft.irfft(density)[: len(density) // 2] / np.mean(np.r_[density, density[1:-1]])
+    r = r[::every]
+    beyond = np.flatnonzero(np.abs(r) > tolerance)
+    return r[: beyond[-1] + 1]
+
+
+def reach(sos: Sections, share: float = 0.01) -> int:
+    """Samples within which the zero-phase filter gathers all but `share` of its (absolute) impulse response.
+
+    That far from an end or a gap its output is made of measured samples, not of the extension.
+    """
+    response = np.abs(np.fft.irfft(_zero_phase_gain(sos)))
+    one_side = np.cumsum(response[len(response) // 2 : 0 : -1])
+    outside = 2 * one_side <= share * response.sum()
+    return len(response) // 2 - int(outside.sum())
+
+
+def _zero_phase_gain(sos: Sections) -> NDArray[np.float64]:
+    """Amplitude of the forward and backward filter, on a grid fine enough for its slowest pole to die out."""
+    from scipy.signal import freqz_sos, sos2zpk
+
+    sos = np.asarray(sos, np.float64)
+    slowest = np.abs(sos2zpk(sos)[1]).max()
+    decay = int(np.ceil(40 / -np.log(slowest))) if slowest < 1 else 1 << 20
+    n = 1 << min(22, max(10, int(np.ceil(np.log2(4 * decay)))))
+    return np.abs(freqz_sos(sos, worN=np.linspace(0, np.pi, n // 2 + 1))[1]) ** 2
+
+
+def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Straight lines across the samples that are not valid, so that a filter can pass; (N, k) or (N,)."""
+    if valid.all():
+        return x
+    index = np.arange(len(x))
+    columns = x.reshape(len(x), -1)
+    filled = np.stack([np.interp(index, index[valid], column[valid]) for column in columns.T], axis=1)
+    return filled.reshape(x.shape)
+
+
+def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[np.bool_]:
+    """Also invalidate `by` samples on both sides of every gap, and at both ends: where a filter saw no measurement."""
+    gone = np.r_[ends, ~valid, ends].astype(np.int64)
+    near = np.convolve(gone, np.ones(2 * by + 1, dtype=np.int64))[by : by + len(gone)]
+    return (near == 0)[1:-1]
+
+
+def jumps(x: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where a signal (N,) leaps between two samples as no joint can move; both samples are True.
+
+    A leap is a difference that exceeds six times all those nearby and twenty times the noise: a recorder that was
+    switched, an encoder that lost counts, a trial that was cut. A filter would ring there, and the ringing would pass
+    for an excitation that the torque never saw.
+    """
+    from scipy.ndimage import maximum_filter1d
+
+    size = np.abs(np.diff(x))
+    size = np.where(np.isfinite(size), size, 0.0)
+    padded = np.pad(size, 6)
+    before, after = (maximum_filter1d(padded, 5)[6 + shift : 6 + shift + len(size)] for shift in (-3, 3))
+    leap = (size > 6 * np.maximum(before, after)) & (size > 20 * noise_level(x))
+    return np.r_[leap, False] | np.r_[False, leap]
+
+
+def noise_level(x: NDArray[np.float64]) -> float:
+    """Standard deviation of the white noise in a smooth, finely sampled signal (N,), from its fourth differences.
+
+    A motion that is slow against the sample rate vanishes in them. The median keeps jumps from counting. A coarse
+    encoder leaves at least the noise of its rounding, step/sqrt(12).
+    """
+    fourth = np.diff(x, 4)
+    fourth = fourth[np.isfinite(fourth)]
+    if not len(fourth):
+        return 0.0
+    robust = 1.4826 * np.median(np.abs(fourth)) / np.sqrt(70.0)
+    return float(max(robust, quantisation_step(x) / np.sqrt(12.0)))
+
+
+def quantisation_step(x: NDArray[np.float64]) -> float:
+    """Step of the encoder or converter that made a signal (N,), or zero where none can be seen.
+
+    The step is the smallest difference between distinct values, provided that all differences are whole multiples of
+    it and values repeat often; a finely resolved signal has no such step.
+    """
+    values, counts = np.unique(x[np.isfinite(x)], return_counts=True)
+    if len(values) < 3 or counts.mean() < 2:
+        return 0.0
+    gaps = np.diff(values)
+    smallest = gaps.min()
+    scale = np.abs(values).max()
+    if smallest <= 1e-12 * scale:
+        return 0.0
+    multiples = gaps / smallest
+    fits = np.abs(multiples - np.round(multiples)) < 0.05
+    step = float(np.median((gaps / np.maximum(np.round(multiples), 1))[fits])) if fits.any() else 0.0
+    return step if fits.mean() > 0.9 else 0.0

@@ -1,0 +1,146 @@
+"""Which windows to believe: the threshold for fake changes, and a verdict with its reason for every window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+from numpy.typing import NDArray
+
+from jaximp.types import AnyArray, nearest
+from jaximp.windows import SlidingFit
+
+TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
+VERDICTS = (TRUSTED, WEAK, FAKE, POOR, NO_DATA)
+
+
+@dataclass(frozen=True)
+class TrustLimits:
+    """What a window must keep to be trusted."""
+
+    min_vaf: float = 0.75
+    """Share of the torque's variance that the model must explain."""
+    max_relative_stderr: float = 0.2
+    """Largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
+    min_excitation_ratio: float = 5.0
+    """How far each column must rise above what noise in the position alone would build: a ratio r biases the
+    estimate by about 1/r^2, four percent at 5."""
+    min_valid_share: float = 0.5
+    """Share of a window's samples that must have been measured and moving."""
+    parameters: tuple[str, ...] = ()
+    """The parameters that matter: only their standard errors and excitation are judged. Empty for all of them."""
+
+
+def fake_change_threshold(
+    W_reference: Num[AnyArray, "N p"], period_samples: int, window_samples: int
+) -> Float[Array, ""]:
+    """Threshold on a window's condition number beyond which a change of its parameters is not real.
+
+    **Arguments:** `W_reference` (N, p), the model's observation matrix on one period of the reference trajectory, of
+    `period_samples`; `window_samples` the window's length at the same sample rate.
+
+    **Source:** Tout et al. 2023, eqs. (16), (17).
+    """
+    singular = jnp.linalg.svd(jnp.asarray(W_reference), compute_uv=False)
+    return singular[0] / singular[-1] * period_samples / window_samples
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """One plain word per window, and the measured number behind it."""
+
+    verdict: NDArray[Any]
+    """(M,) one of `VERDICTS`."""
+    reason: NDArray[Any]
+    """(M,) a sentence; empty where the window is trusted."""
+
+    @property
+    def trusted(self) -> NDArray[np.bool_]:
+        return self.verdict == TRUSTED
+
+    def counts(self) -> dict[str, int]:
+        """How many windows got each verdict."""
+        return {verdict: int((self.verdict == verdict).sum()) for verdict in VERDICTS}
+
+
+def judge(
+    fit: SlidingFit,
+    names: tuple[str, ...],
+    window_samples: int,
+    parameter_scale: NDArray[np.float64],
+    column_noise: NDArray[np.float64],
+    threshold: float | None = None,
+    limits: TrustLimits = TrustLimits(),
+) -> Verdicts:
+    """Give every window its verdict; the first rule that a window breaks names it.
+
+    1. *no data*: too few samples were measured (and moving).
+    2. *weak excitation*: columns are collinear, or no larger than noise in the position makes them, or a standard
+       error is too large. The condition number alone cannot tell: on a still arm, noise builds a well conditioned
+       regressor.
+    3. *fake change*: the condition number is above the threshold of eqs. (16), (17), where one is given.
+    4. *poor fit*: the model explains too little of the torque.
+
+    **Arguments:** `names` (p) of the parameters; `window_samples` torque samples in a full window;
+    `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
+    `column_noise` (p,) root mean square of each column that noise in the position alone gives.
+    """
+    theta, stderr, excitation = (np.asarray(x) for x in (fit.theta, fit.stderr, fit.excitation))
+    samples, cond, vaf = (np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = stderr / np.maximum(np.abs(theta), parameter_scale)
+        built_by_noise = np.sqrt(samples)[:, None] * column_noise
+        ratio = np.where(built_by_noise > 0, excitation / built_by_noise, np.inf)
+    judged = _judged(names, limits.parameters)
+    error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
+    noisiest, loosest = ratio.argmin(axis=1), error.argmax(axis=1)
+    ratio, error = ratio.min(axis=1), error.max(axis=1)
+    rules: list[tuple[NDArray[np.bool_], str, Callable[[int], str]]] = [
+        (
+            (samples < limits.min_valid_share * window_samples) | (samples < theta.shape[1]),
+            NO_DATA,
+            lambda k: f"{samples[k]} of {window_samples} samples can be used",
+        ),
+        (
+            ~np.isfinite(theta).all(axis=1),
+            WEAK,
+            lambda k: "columns are zero or collinear: the parameters cannot be told apart",
+        ),
+        (
+            ratio < limits.min_excitation_ratio,
+            WEAK,
+            lambda k: f"{names[noisiest[k]]}: its column is {ratio[k]:.2g} times what position noise alone builds",
+        ),
+        (
+            ~(error <= limits.max_relative_stderr),
+            WEAK,
+            lambda k: f"{names[loosest[k]]}: its standard error is {error[k]:.0%} of its size",
+        ),
+        (
+            np.full(len(cond), False) if threshold is None else ~(cond < threshold),
+            FAKE,
+            lambda k: f"the condition number {cond[k]:.3g} is not below the threshold {threshold:.3g}",
+        ),
+        (
+            ~(vaf >= limits.min_vaf),
+            POOR,
+            lambda k: f"the model explains {vaf[k]:.0%} of the torque's variance",
+        ),
+    ]
+    broken = np.stack([mask for mask, _, _ in rules])
+    first = np.where(broken.any(axis=0), broken.argmax(axis=0), len(rules))
+    verdict = np.array([name for _, name, _ in rules] + [TRUSTED])[first]
+    reason = ["" if rule == len(rules) else rules[rule][2](k) for k, rule in enumerate(first)]
+    return Verdicts(verdict, np.array(reason))
+
+
+def _judged(names: tuple[str, ...], chosen: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Which parameters the verdict looks at."""
+    for name in chosen:
+        if name not in names:
+            raise ValueError(f"trust.parameters has an unknown parameter '{name}': {nearest(name, list(names))}")
+    return np.array([not chosen or name in chosen for name in names])

@@ -1,0 +1,75 @@
+"""What crosses the borders between modules: names of shapes, and the recording.
+
+Shapes, everywhere in jaximp: time is axis 0. `N` samples, `M` windows, `S` samples in a window, `n` joints,
+`p` parameters. SI units inside; other units are converted where files are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+AnyArray = Any
+"""What public functions take: arrays of JAX or numpy. (Their shape and kind of number are checked all the same.)"""
+
+type_of_joint = ("revolute", "prismatic")
+
+Progress = Callable[[float], None]
+"""Called with the finished share of a long computation, from 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One measured motion on a uniform time grid, in SI units.
+
+    Angles [rad] and torques [N m] for revolute joints, positions [m] and forces [N] for prismatic ones. A sample
+    that was not measured (a gap, NaN) is False in `valid` and NaN in the arrays.
+    """
+
+    time: NDArray[np.float64]
+    """(N,) uniformly spaced time stamps [s]."""
+    position: NDArray[np.float64]
+    """(N, n) joint position."""
+    torque: NDArray[np.float64]
+    """(N, n) torque of each joint, with the sign of the model."""
+    valid: NDArray[np.bool_]
+    """(N,) False where the sample must not be used."""
+    joints: tuple[str, ...]
+    """`revolute` or `prismatic`, for each joint."""
+    velocity: NDArray[np.float64] | None = None
+    """(N, n) measured velocity."""
+    acceleration: NDArray[np.float64] | None = None
+    """(N, n) measured acceleration."""
+    force: NDArray[np.float64] | None = None
+    """(N, k) force at the endpoint [N]."""
+    reference: NDArray[np.float64] | None = None
+    """(N, n) position that the controller was asked to follow."""
+    name: str = "recording"
+    notes: tuple[str, ...] = ()
+    """What reading the file changed or noticed, in plain words."""
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second [Hz]."""
+        return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
+
+    @property
+    def n_joints(self) -> int:
+        return self.position.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def nearest(name: str, choices: list[str]) -> str:
+    """A hint for error messages: the choice that `name` was probably meant to be, and all of them if none is near."""
+    import difflib
+
+    close = difflib.get_close_matches(name, choices, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return "there are: " + ", ".join(f"'{choice}'" for choice in choices)

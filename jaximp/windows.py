@@ -1,0 +1,163 @@
+"""Least squares over all sliding windows at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Integer, Num, Shaped
+from numpy.typing import NDArray
+
+from jaximp.least_squares import WindowFit, check_finite, least_squares, variance_accounted_for
+from jaximp.signals import require_float64
+from jaximp.types import AnyArray
+
+BATCH_NUMBERS = 4_000_000
+"""How many numbers of W are gathered at a time (32 MB): windows overlap, so that all together would not fit."""
+
+
+class SlidingFit(eqx.Module):
+    """One estimate per window; a window without a unique solution is NaN throughout, `last` and `samples` apart."""
+
+    theta: Float[Array, "*M p"]
+    """Parameters, in the model's units."""
+    stderr: Float[Array, "*M p"]
+    """Their standard errors."""
+    dof: Float[Array, "*M"]
+    """Degrees of freedom of the standard errors (see `least_squares.confidence_interval`)."""
+    cond: Float[Array, "*M"]
+    """Condition number of the window's W."""
+    sigma_min: Float[Array, "*M"]
+    """Smallest singular value of the window's W."""
+    excitation: Float[Array, "*M p"]
+    """Norm of each column's part that the other columns cannot imitate."""
+    residual_rms: Float[Array, "*M"]
+    """Root of the mean squared residual [N m]."""
+    vaf: Float[Array, "*M"]
+    """Variance accounted for, 1 - var(residual)/var(torque)."""
+    samples: Int[Array, "*M"]
+    """Torque samples that counted."""
+    last: Int[Array, "*M"]
+    """Index of each window's last sample."""
+
+
+def window_starts(n_samples: int, window: int, step: int = 1) -> NDArray[np.int64]:
+    """First sample of every window that fits into the recording."""
+    for name, value in (("window", window), ("step", step)):
+        if not isinstance(value, int | np.integer):
+            raise ValueError(f"{name} is {value!r}: it must be a whole number of samples")
+        if value <= 0:
+            raise ValueError(f"{name} is {value}: it must be at least one sample")
+    if window > n_samples:
+        raise ValueError(f"the window has {window} samples, but there are only {n_samples}: shorten the window")
+    return np.arange(0, n_samples - window + 1, step)
+
+
+def sliding_least_squares(
+    W: Num[AnyArray, "..."],
+    y: Num[AnyArray, "..."],
+    window: int,
+    step: int = 1,
+    *,
+    valid: Shaped[AnyArray, "..."] | None = None,
+    noise: Num[AnyArray, " L"] | Num[AnyArray, "S S"] | None = None,
+) -> SlidingFit:
+    """Fit `y = W @ theta` in every window of `window` samples, `step` samples apart.
+
+    **Arguments:** `W` (N, p), or (N, n, p) for n outputs that share the parameters; `y` (N,) or (N, n) [N m];
+    `valid` (N,) or (N, n), False for samples that must not count; `noise` the autocovariance by lag of the noise in y
+    (`signals.autocovariance` of the filter it went through), or the covariance matrix of a window's rows.
+
+    **Returns:** a `SlidingFit`. Without `noise` the standard errors are the textbook ones, RSS/(S - p): after a
+    low-pass filter they are several times too small.
+
+    **Raises:** `ValueError` for shapes that disagree, a window that is longer than the recording or has fewer samples
+    than parameters, and numbers that are not finite where `valid` does not exclude them.
+
+    **Source:** Tout et al. 2023, III-B.
+    """
+    require_float64(W, y)
+    W, y, valid = _checked(W, y, valid, window)
+    starts = window_starts(len(W), window, step)
+    noise = None if noise is None else jnp.asarray(noise, W.dtype)
+    return _solve_all(W, y, valid, noise, jnp.asarray(starts), window)
+
+
+@partial(jax.jit, static_argnames="window")
+def _solve_all(W: Array, y: Array, valid: Array, noise: Array | None, starts: Array, window: int) -> SlidingFit:
+    def one(start: Array) -> SlidingFit:
+        rows, torque, counts = slice_window((W, y, valid), start, window)
+        return _as_sliding(least_squares(rows, torque, counts, noise), start + window - 1)
+
+    return map_windows(one, starts, window * math.prod(W.shape[1:]))
+
+
+def map_windows(function: Callable[[Any], Any], starts: Any, numbers_per_window: int) -> Any:
+    """Apply a function of a window's start to all windows, as many at a time as memory suggests."""
+    n_windows = len(jax.tree.leaves(starts)[0])
+    n_batch = max(1, min(256, n_windows, BATCH_NUMBERS // numbers_per_window))
+    # Whole batches only: a remainder would be compiled a second time.
+    full = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], -n_windows % n_batch, axis=0)]), starts)
+    return jax.tree.map(lambda x: x[:n_windows], jax.lax.map(function, full, batch_size=n_batch))
+
+
+def slice_window(arrays: tuple[Array, ...], start: Array, window: int) -> tuple[Array, ...]:
+    """The `window` samples of every array from `start` on."""
+    return tuple(jax.lax.dynamic_slice_in_dim(array, start, window) for array in arrays)
+
+
+def _as_sliding(fit: WindowFit, last: Array) -> SlidingFit:
+    """A window's fit without its covariance matrix, which would fill the memory."""
+    shared = {name: getattr(fit, name) for name in SlidingFit.__annotations__ if name not in ("last", "stderr")}
+    return SlidingFit(stderr=fit.stderr, last=last, **shared)
+
+
+@partial(jax.jit, static_argnames="window")
+def held_out_vaf(
+    W: Num[AnyArray, "N *n p"],
+    y: Num[AnyArray, "N *n"],
+    valid: Shaped[AnyArray, "N *n"],
+    theta: Num[AnyArray, "M p"],
+    start: Integer[AnyArray, " M"],
+    window: int,
+) -> Float[Array, " M"]:
+    """How well parameters predict the torque of a window that they have not seen: its VAF.
+
+    **Arguments:** `start` (M,) where the unseen window begins that each `theta` is to predict.
+
+    **Returns:** NaN where less than a whole window follows or fewer than half of its samples are valid.
+    """
+
+    def one(theta_and_start: tuple[Array, Array]) -> Array:
+        parameters, first = theta_and_start
+        rows, torque, counts = slice_window((W, y, valid), first, window)
+        weight = counts.astype(W.dtype)
+        vaf = variance_accounted_for(torque, torque - rows @ parameters, weight)
+        return jnp.where((first + window <= len(W)) & (weight.mean() >= 0.5), vaf, jnp.nan)
+
+    return map_windows(one, (theta, start), window * math.prod(W.shape[1:]))
+
+
+def _checked(W: AnyArray, y: AnyArray, valid: AnyArray | None, window: int) -> tuple[Array, Array, Array]:
+    """Arrays of floating point numbers with shapes that agree, or an error that names what does not."""
+    W, y = (jnp.asarray(array) for array in (W, y))
+    W, y = (array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float) for array in (W, y))
+    if W.ndim not in (2, 3) or y.shape != W.shape[:-1]:
+        raise ValueError(f"W has shape {W.shape} and y {y.shape}: expected (N, p) and (N,), or (N, n, p) and (N, n)")
+    if valid is None:
+        valid = jnp.ones(y.shape, bool)
+    else:
+        valid = jnp.asarray(valid, bool)
+        if valid.shape not in (y.shape, y.shape[:1]):
+            raise ValueError(f"valid has shape {valid.shape}: expected {y.shape} or {y.shape[:1]}")
+        valid = jnp.broadcast_to(valid.reshape(valid.shape + (1,) * (y.ndim - valid.ndim)), y.shape)
+    if isinstance(window, int | np.integer) and 0 < window * math.prod(y.shape[1:]) < W.shape[-1]:
+        raise ValueError(f"a window of {window} samples cannot determine {W.shape[-1]} parameters: lengthen the window")
+    check_finite(W, y, valid)
+    return W, y, valid

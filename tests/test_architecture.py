@@ -1,0 +1,126 @@
+"""Imports point down only, and what must stay in one place stays there."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "jaximp"
+
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("cli",),
+    ("studies",),
+    ("report", "check"),
+    ("plots",),
+    ("identify",),
+    ("regression",),
+    ("job",),
+    ("payload",),
+    ("trust",),
+    ("windows", "recursive"),
+    ("least_squares",),
+    ("simulation",),
+    ("models",),
+    ("recordings", "trajectories"),
+    ("signals",),
+    ("outputs", "types"),
+)
+"""From top to bottom; a module imports from strictly lower layers, and a folder from itself."""
+
+HEIGHT = {name: -depth for depth, layer in enumerate(LAYERS) for name in layer}
+
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+del MODULES["__init__"]  # the public names: imports from everywhere, and is imported from nowhere
+every_module = pytest.mark.parametrize("module", MODULES)
+
+
+def tree(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+def imports(module: str) -> Iterator[str]:
+    """Every name that a module imports, with dots, at its top or inside a function: `numpy`, `jaximp.types`, ..."""
+    here = ["jaximp", *module.split(".")]
+    inside = here if MODULES[module].name == "__init__.py" else here[:-1]
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = ".".join(inside[: len(inside) - node.level + 1]) + "." if node.level else ""
+            source = (start + (node.module or "")).strip(".")
+            yield from (f"{source}.{name.name}" for name in node.names)
+
+
+def own(module: str) -> Iterator[str]:
+    """The layer of every module of the package that a module imports; the package itself is an empty string."""
+    for name in imports(module):
+        parts = name.split(".")
+        if parts[0] == "jaximp":
+            known = len(parts) > 1 and (parts[1] in HEIGHT or parts[1] in MODULES)
+            yield parts[1] if known else ""
+
+
+def called(module: str) -> Iterator[str]:
+    """What a module calls, as written: `print`, `jax.config.update`, ..."""
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func)
+
+
+@every_module
+def test_imports_point_down(module: str) -> None:
+    layer = module.split(".")[0]
+    assert layer in HEIGHT, f"'{layer}' is new: give it a layer in this test"
+    for other in own(module):
+        assert other, f"{module} imports from the package itself: import from the module that holds the name"
+        assert other in HEIGHT, f"'{other}' is new: give it a layer in this test"
+        assert other == layer or HEIGHT[other] < HEIGHT[layer], f"{module} imports {other}, which is not below it"
+
+
+@every_module
+def test_only_plots_imports_matplotlib(module: str) -> None:
+    if module != "plots":
+        assert not [name for name in imports(module) if name.split(".")[0] == "matplotlib"]
+
+
+@every_module
+def test_only_the_command_line_changes_the_configuration_of_jax(module: str) -> None:
+    if module != "cli":
+        assert not [call for call in called(module) if call.endswith("config.update")]
+        assert "jax.config" not in imports(module)
+        changed = [
+            ast.unparse(target)
+            for node in ast.walk(tree(module))
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+        ]
+        assert not [target for target in changed if "config.jax" in target]
+
+
+@every_module
+def test_only_the_command_line_prints(module: str) -> None:
+    if module != "cli":
+        assert not [call for call in called(module) if call.split(".")[-1] in ("print", "pprint")]
+        assert not [call for call in called(module) if call in ("sys.stdout.write", "sys.stderr.write")]
+
+
+def test_importing_the_library_leaves_jax_as_it_is() -> None:
+    below = [f"jaximp.{name}" for name in MODULES if name.split(".")[0] not in ("cli", "studies")]
+    program = (
+        "import importlib, jax\n"
+        f"for name in ['jaximp', *{below}]:\n"
+        "    importlib.import_module(name)\n"
+        "assert not jax.config.jax_enable_x64, 'x64 was switched on'"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "JAX_ENABLE_X64"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,77 @@
+"""The job file: every key and value is checked, and the message says what to do."""
+
+from pathlib import Path
+
+import pytest
+
+from jaximp.job import parse_job, read_job
+from jaximp.models import HumanJoint, Joints, RobotJoint
+
+GOOD = """
+[recording]
+file = "x.csv"
+[model]
+human = true
+[window]
+length = 2
+"""
+
+
+def test_a_small_job_has_defaults() -> None:
+    job = parse_job(GOOD)
+    assert job.window.length == 2.0
+    assert job.filter.mode == "once"
+    assert job.model.methods == (1,)
+    robot, human = job.models(("revolute",))
+    assert robot is None
+    assert isinstance(human, HumanJoint)
+
+
+def test_models_follow_the_joints() -> None:
+    job = parse_job(GOOD.replace("human = true", "robot = { offset = true, gravity = false }"))
+    robot, _ = job.models(("prismatic",))
+    assert isinstance(robot, RobotJoint)
+    assert robot.units[-1] == "N"
+    both, _ = job.models(("revolute", "revolute"))
+    assert isinstance(both, Joints)
+    assert both.n_joints == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("length = 2", "lenght = 2", "unknown key 'lenght': did you mean 'length'"),
+        ("length = 2", "", "has no 'length'"),
+        ("length = 2", 'length = "2 s"', "window.length is '2 s': it must be a number"),
+        ("length = 2", "length = 0", "window.length is 0.0: it must be above zero"),
+        ("length = 2", "length = true", "must be a number"),
+        ("human = true", "human = 3", "must be a table"),
+        ("human = true", "humen = true", "did you mean 'human'"),
+        ("human = true", "human = false", "is empty"),
+        ("human = true", "human = true\nrobot = true", "add a [robot_recording] table"),
+        ("human = true", "human = true\nmethods = [5]", "list some of 1, 2, 3 and 4"),
+        ("human = true", "human = {gear_ratio = 0}", "gear_ratio is 0.0: it must be a positive number"),
+        ("[window]", "[trust]\nmin_vaf = 'x'\n[window]", "trust.min_vaf"),
+        ("[window]", "[trust]\nparameters = 'x'\n[window]", "must be a list of names"),
+        ("[window]", "[filter]\nmode = 'twice'\n[window]", "filter.mode is 'twice'"),
+        ("[window]", "[filter]\ndecimate = 2.5\n[window]", "filter.decimate is 2.5: it must be a whole number"),
+        ("[window]", "[filter]\nhigh_pass = 1\n[window]", "set offset = false"),
+        ("[window]", "[robot_recording]\nfile='y'\n[window]", "of use only with both"),
+        ("[recording]", "[recordings]", "unknown key 'recordings': did you mean 'recording'"),
+        ("[model]\nhuman = true", "", "has no [model] table"),
+        ("[recording]\nfile = \"x.csv\"", "recording = 3", "must be a table"),
+    ],
+)
+def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_job(GOOD.replace(old, new, 1)).models(("revolute",))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="there is no such job file"):
+        read_job(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("= 3")
+    with pytest.raises(ValueError, match="not a TOML file"):
+        read_job(tmp_path / "bad.toml")

@@ -1,0 +1,172 @@
+"""Figures: they render, say units, show intervals, and stay small for long recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from jaximp import plots
+from jaximp.identify import Estimates, identify_recording
+from jaximp.job import parse_job
+from jaximp.trust import TRUSTED, WEAK, Verdicts
+from jaximp.types import Recording
+
+JOB = """
+recording = { file = "made in the test", position = "q", torque = "tau" }
+model.human = { offset = true }
+window = { length = 2, step = 0.25 }
+filter = { position_cutoff = 15, decimation_cutoff = 15 }
+"""
+
+
+def recording(still: tuple[float, float] = (10, 16), name: str = "multisine") -> Recording:
+    """A joint of known impedance on several sines of unlike frequency, which stands still for a while."""
+    rate = 200.0
+    time = np.arange(0, 25, 1 / rate)
+    phases = [2 * np.pi * f * time + f**2 for f in (0.4, 1.1, 2.3, 4.7)]
+    frequencies = [2 * np.pi * f for f in (0.4, 1.1, 2.3, 4.7)]
+    moving = 1 - 1 / (1 + np.exp(-8 * (time - still[0]))) * 1 / (1 + np.exp(8 * (time - still[1])))
+    position = 0.05 * moving * sum(np.sin(phase) / w for phase, w in zip(phases, frequencies, strict=True))
+    velocity = np.gradient(position, time)
+    noise = np.random.default_rng(1).normal(0, 0.005, len(time))
+    torque = 0.015 * np.gradient(velocity, time) + 0.7 * velocity + 60 * (position - 0.01) + noise
+    measured = position + np.random.default_rng(2).normal(0, 1e-6, len(time))
+    return Recording(
+        time=time,
+        position=measured[:, None],
+        torque=torque[:, None],
+        valid=np.ones(len(time), bool),
+        joints=("revolute",),
+        name=name,
+    )
+
+
+@cache
+def identified() -> Estimates:
+    return identify_recording(parse_job(JOB), recording())[0]
+
+
+@pytest.fixture
+def estimates() -> Estimates:
+    return identified()
+
+
+def repeat(estimates: Estimates, windows: int, samples: int) -> Estimates:
+    """The same estimates over and over, as a very long recording would have them."""
+    k, n = np.arange(windows) % len(estimates.end), np.arange(samples) % len(estimates.time)
+    return replace(
+        estimates,
+        fit=jax.tree.map(lambda x: x[k], estimates.fit),
+        start=np.arange(windows) * 0.25,
+        end=np.arange(windows) * 0.25 + 2,
+        held_out_vaf=estimates.held_out_vaf[k],
+        verdicts=Verdicts(estimates.verdicts.verdict[k], estimates.verdicts.reason[k]),
+        time=np.arange(samples) / 200,
+        torque=estimates.torque[n],
+        reconstructed=estimates.reconstructed[n],
+        predicted=estimates.predicted[n],
+    )
+
+
+def without_trust(estimates: Estimates) -> Estimates:
+    n = len(estimates.end)
+    return replace(estimates, verdicts=Verdicts(np.full(n, WEAK), np.full(n, "stiffness: as the test says")))
+
+
+FIGURES = {
+    "parameters": plots.parameters_over_time,
+    "condition": plots.condition_over_time,
+    "torque": plots.torque,
+    "spectrum": plots.residual_spectrum,
+    "window_lengths": lambda estimates: plots.window_lengths([estimates, replace(estimates, window=4.0)]),
+    "methods": lambda estimates: plots.methods([replace(estimates, method=1), replace(estimates, method=3)]),
+}
+UNITS = {
+    "parameters": ("[kg m²]", "[N m s/rad]", "[N m/rad]", "[N m]", "end of the window [s]"),
+    "condition": ("[1]", "end of the window [s]"),
+    "torque": ("torque [N m]", "residual [N m]", "time [s]"),
+    "spectrum": ("[(N m)²/Hz]", "frequency [Hz]"),
+    "window_lengths": ("stiffness [N m/rad]", "window length [s]", "[1]"),
+    "methods": ("stiffness [N m/rad]", "end of the window [s]"),
+}
+
+
+def words_on(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figure_renders_and_says_its_units(name: str, estimates: Estimates) -> None:
+    before = dict(matplotlib.rcParams)
+    figure = FIGURES[name](estimates)
+    assert plots.png(figure).startswith(b"\x89PNG")
+    for label in UNITS[name]:
+        assert label in words_on(figure)
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figure_shows_no_mean_without_any_trusted_window(name: str, estimates: Estimates) -> None:
+    figure = FIGURES[name](without_trust(estimates))
+    assert "mean over trusted" not in words_on(figure)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figure_renders_without_any_number(name: str, estimates: Estimates) -> None:
+    fit = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan), estimates.fit)
+    nothing = np.full_like(estimates.torque, np.nan)
+    empty = replace(without_trust(estimates), fit=fit, torque=nothing, reconstructed=nothing, predicted=nothing)
+    assert plots.png(FIGURES[name](replace(empty, held_out_vaf=np.full(len(empty.end), np.nan))))
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_long_recordings_are_thinned(name: str, estimates: Estimates) -> None:
+    figure = FIGURES[name](repeat(estimates, 50_000, 1_000_000))
+    lines = [line for panel in figure.axes for line in panel.get_lines()]
+    assert lines
+    if name != "spectrum":  # its points are frequencies, an eighth of a stretch without a gap
+        assert max(len(line.get_xdata()) for line in lines) <= plots.POINTS
+
+
+def test_still_phase_is_shaded_and_trusted_windows_have_a_band(estimates: Estimates) -> None:
+    counts = estimates.verdicts.counts()
+    assert counts[TRUSTED] > 10
+    assert sum(counts.values()) - counts[TRUSTED] > 5
+    figure = plots.parameters_over_time(estimates)
+    for panel in figure.axes:
+        assert any(collection.get_hatch() for collection in panel.collections)
+    words = words_on(figure)
+    assert "95% interval" in words
+    assert "mean over trusted" in words
+
+
+def test_a_wild_window_does_not_squash_the_others(estimates: Estimates) -> None:
+    wild = int(np.flatnonzero(~estimates.verdicts.trusted)[0])
+    fit = eqx.tree_at(lambda fit: fit.theta, estimates.fit, estimates.fit.theta.at[wild].set(1e12))
+    limits = [panel.get_ylim() for panel in plots.parameters_over_time(replace(estimates, fit=fit)).axes]
+    assert limits == [panel.get_ylim() for panel in plots.parameters_over_time(estimates).axes]
+
+
+def test_envelope_keeps_a_spike() -> None:
+    y: NDArray[np.float64] = np.zeros(100_000)
+    y[54_321] = 7.0
+    panel = Figure().subplots()
+    plots._line(panel, np.arange(len(y), dtype=float), y)
+    assert panel.get_lines()[0].get_ydata().max() == 7.0
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(63.2862, "63.29"), (6.334e-5, "6.334×10⁻⁵"), (-2.5e12, "−2.5×10¹²"), (0.0, "0"), (float("nan"), "–")],
+)
+def test_numbers_are_written_for_people(value: float, text: str) -> None:
+    assert plots.number(value) == text

@@ -1,0 +1,624 @@
+"""Reading recordings: units, readers, sampling, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from jaximp.recordings import load_recording, recording_from_arrays, recording_from_mapping, save_recording
+from jaximp.types import Recording
+
+CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference")
+MAPPING = {"time": "t", "position": "q", "torque": "tau"}
+
+
+def signals(n: int = 50, rate: float = 100.0) -> dict[str, np.ndarray]:
+    t = np.arange(n) / rate
+    return {"t": t, "q": np.sin(5 * t), "tau": np.cos(3 * t) - 0.5}
+
+
+def write_csv(path: Path, columns: dict[str, Any], delimiter: str = ",") -> Path:
+    rows = zip(*columns.values(), strict=True)
+    lines = [delimiter.join(columns), *(delimiter.join(str(value) for value in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def matches(text: str) -> str:
+    """A pattern for an error that consists of one line and contains `text`."""
+    return rf"\A[^\n]*{re.escape(text)}[^\n]*\Z"
+
+
+def assert_equal(one: Recording, other: Recording) -> None:
+    assert one.joints == other.joints
+    for channel in ("time", "valid", *CHANNELS):
+        np.testing.assert_array_equal(getattr(one, channel), getattr(other, channel), err_msg=channel)
+
+
+# --- readers ----------------------------------------------------------------------------------------------------------
+
+
+def nested_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    scipy.io.savemat(path, {"data": {"inner": columns}})
+    return {key: f"data.inner.{column}" for key, column in MAPPING.items()}
+
+
+def row_vector_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    scipy.io.savemat(path, columns, oned_as="row")
+    return MAPPING
+
+
+def new_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in columns.items():
+            file[f"data/{name}"] = values[None, :]  # MATLAB's (N, 1) is (1, N) in HDF5
+    return {key: f"data.{column}" for key, column in MAPPING.items()}
+
+
+def hdf5(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            file[f"run/{name}"] = values
+    return {key: f"run/{column}" for key, column in MAPPING.items()}
+
+
+def npz(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    np.savez(path, **columns)
+    return MAPPING
+
+
+def parquet(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+    pyarrow.parquet.write_table(pyarrow.table({**columns, "comment": ["x"] * len(columns["t"])}), path)
+    return MAPPING
+
+
+def text_file(delimiter: str) -> Callable[[Path, dict[str, np.ndarray]], dict[str, Any]]:
+    def write(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
+        write_csv(path, {f" {name}": values for name, values in columns.items()}, delimiter)
+        return MAPPING
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("file", "write"),
+    [
+        pytest.param("a.csv", text_file(","), id="csv-comma"),
+        pytest.param("a.txt", text_file(";"), id="txt-semicolon"),
+        pytest.param("a.TSV", text_file("\t"), id="tsv-tab"),
+        pytest.param("a.parquet", parquet, id="parquet"),
+        pytest.param("a.mat", nested_mat, id="mat-v5-struct"),
+        pytest.param("a.mat", row_vector_mat, id="mat-v5-row-vectors"),
+        pytest.param("a.mat", new_mat, id="mat-v7.3"),
+        pytest.param("a.h5", hdf5, id="hdf5"),
+        pytest.param("a.npz", npz, id="npz"),
+    ],
+)
+def test_every_format_gives_the_same_recording(tmp_path: Path, file: str, write: Callable[..., dict[str, Any]]) -> None:
+    columns = signals()
+    mapping = write(tmp_path / file, columns)
+    recording = load_recording(tmp_path / file, **mapping)
+    assert_equal(recording, recording_from_arrays(columns["t"], columns["q"], columns["tau"]))
+    assert recording.name == "a"
+    assert recording.notes == ()
+    for channel in ("time", "position", "torque", "valid"):
+        array = getattr(recording, channel)
+        assert array.flags.c_contiguous
+        assert not array.flags.writeable
+
+
+def write_matrix_mat(path: Path, values: dict[str, np.ndarray]) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in values.items():
+            file[name] = np.atleast_2d(array).T
+
+
+@pytest.mark.parametrize(
+    ("file", "write"),
+    [
+        pytest.param("a.mat", scipy.io.savemat, id="mat-v5"),
+        pytest.param("a.mat", write_matrix_mat, id="mat-v7.3"),
+        pytest.param("a.npz", lambda path, values: np.savez(path, **values), id="npz"),
+    ],
+)
+def test_matrix_is_a_channel_of_several_joints_and_the_rate_is_a_variable(
+    tmp_path: Path, file: str, write: Callable[..., None]
+) -> None:
+    q = np.random.default_rng(0).normal(size=(20, 2))
+    write(tmp_path / file, {"q": q, "tau": 3 * q, "fs": np.array(0.25)})
+    rate = {"column": "fs", "unit": "kHz"}
+    recording = load_recording(tmp_path / file, sample_rate=rate, position="q", torque=["tau"])
+    np.testing.assert_array_equal(recording.position, q)
+    np.testing.assert_array_equal(recording.torque, 3 * q)
+    np.testing.assert_allclose(recording.time, np.arange(20) / 250, rtol=1e-14)
+    assert recording.sample_rate == pytest.approx(250)
+    assert recording.joints == ("revolute", "revolute")
+
+
+def test_integer_columns_become_float64(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", {"t": range(5), "q": [1, 2, 3, 2, 1], "tau": [0, 1, 0, 1, 0]})
+    recording = load_recording(path, **MAPPING, name="integers")
+    assert recording.position.dtype == np.float64
+    assert recording.name == "integers"
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+DEG = np.pi / 180
+
+
+@pytest.mark.parametrize(
+    ("channel", "joint", "entry", "factor"),
+    [
+        pytest.param("position", "revolute", {}, 1, id="si"),
+        pytest.param("position", "revolute", {"unit": "deg"}, DEG, id="deg"),
+        pytest.param("position", "revolute", {"unit": "mrad", "sign": -1}, -1e-3, id="sign"),
+        pytest.param("position", "prismatic", {"unit": "mm"}, 1e-3, id="mm"),
+        pytest.param("position", "revolute", {"unit": "count", "gain": "0.002 rad/count"}, 0.002, id="encoder-counts"),
+        pytest.param("position", "revolute", {"gain": "0.5 deg"}, 0.5 * DEG, id="gain-of-a-bare-column"),
+        pytest.param("velocity", "revolute", {"unit": "rpm"}, 2 * np.pi / 60, id="rpm"),
+        pytest.param("velocity", "revolute", {"unit": "deg/s"}, DEG, id="deg-per-s"),
+        pytest.param("acceleration", "prismatic", {"unit": "mm/s^2"}, 1e-3, id="mm-per-s2"),
+        pytest.param("torque", "revolute", {"unit": "Nm"}, 1, id="Nm"),
+        pytest.param("torque", "revolute", {"unit": "mNm"}, 1e-3, id="mNm"),
+        pytest.param("torque", "revolute", {"unit": "N*cm"}, 1e-2, id="N-cm"),
+        pytest.param("torque", "revolute", {"gain": 35.0}, 35, id="bare-gain"),
+        pytest.param("torque", "revolute", {"gain": "35", "unit": "mN m"}, 0.035, id="bare-gain-unit-of-product"),
+        pytest.param("torque", "prismatic", {"unit": "V", "gain": "35.1507 N/V"}, 35.1507, id="gain-with-unit"),
+        pytest.param("torque", "revolute", {"unit": "mA", "gain": "2 (N m)/A"}, 2e-3, id="torque-constant"),
+        pytest.param("force", "revolute", {"unit": "kgf"}, 9.80665, id="force"),
+        pytest.param("reference", "prismatic", {"unit": "cm"}, 1e-2, id="reference"),
+    ],
+)
+def test_units(tmp_path: Path, channel: str, joint: str, entry: dict[str, Any], factor: float) -> None:
+    path = tmp_path / "a.npz"
+    columns = signals()
+    np.savez(path, **columns, x=columns["q"])
+    mapping = MAPPING | {channel: {"column": "x", **entry}}
+    values = getattr(load_recording(path, **mapping, joint=joint), channel)
+    np.testing.assert_allclose(values[:, 0], factor * columns["q"], rtol=1e-14)
+
+
+def test_time_in_milliseconds_and_mixed_joints(tmp_path: Path) -> None:
+    columns = signals()
+    path = tmp_path / "a.npz"
+    np.savez(
+        path, t=1000 * columns["t"], q=np.c_[columns["q"], columns["q"]], tau=np.c_[columns["tau"], columns["tau"]]
+    )
+    mapping = MAPPING | {"time": {"column": "t", "unit": "ms"}}
+    recording = load_recording(path, **mapping, joint=["revolute", "prismatic"])
+    np.testing.assert_allclose(recording.time, columns["t"], atol=1e-12)
+    assert recording.joints == ("revolute", "prismatic")
+
+
+def test_gear_ratio_brings_motor_columns_to_the_joint(tmp_path: Path) -> None:
+    columns = signals()
+    np.savez(tmp_path / "a.npz", **columns)
+    everything = MAPPING | dict.fromkeys(("velocity", "acceleration", "reference", "force"), "q")
+    recording = load_recording(tmp_path / "a.npz", **everything, gear_ratio=4)
+    for channel in ("position", "velocity", "acceleration", "reference"):
+        np.testing.assert_allclose(getattr(recording, channel)[:, 0], columns["q"] / 4)
+    np.testing.assert_allclose(recording.torque[:, 0], columns["tau"] * 4)
+    np.testing.assert_allclose(recording.force[:, 0], columns["q"])
+
+
+@given(q=hnp.arrays(float, 10, elements=st.floats(-1e6, 1e6), unique=True))
+@settings(max_examples=25, deadline=None, derandomize=True)
+def test_degrees_and_radians_agree(tmp_path_factory: pytest.TempPathFactory, q: np.ndarray) -> None:
+    path = tmp_path_factory.mktemp("units") / "a.npz"
+    np.savez(path, rad=q, deg=np.rad2deg(q), tau=q)
+    in_rad = load_recording(path, sample_rate=100, position="rad", torque="tau")
+    in_deg = load_recording(path, sample_rate=100, position={"column": "deg", "unit": "deg"}, torque="tau")
+    np.testing.assert_allclose(in_deg.position, in_rad.position, rtol=1e-14, atol=1e-300)
+
+
+def test_si_units_need_no_unit_library(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **signals())
+    code = (
+        "import sys; from jaximp.recordings import load_recording as load;"
+        "heavy = {'pint', 'pandas', 'pyarrow', 'h5py'}; assert not heavy & set(sys.modules), 'at import';"
+        "load('a.npz', time='t', position={'column': 'q', 'unit': 'rad'}, torque={'column': 'tau', 'unit': 'Nm'});"
+        "assert not heavy & set(sys.modules), 'after loading'"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# --- saving -----------------------------------------------------------------------------------------------------------
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    size, n = draw(st.integers(3, 20)), draw(st.integers(1, 3))
+    matrices = hnp.arrays(np.float64, (size, n), elements=finite)
+    moving = matrices.filter(lambda values: (np.ptp(values[:3] / 4, axis=0) > 0).any())
+    optional = {c: draw(st.none() | matrices) for c in ("velocity", "acceleration", "force", "reference")}
+    position, torque = draw(moving), draw(moving)
+    masked = draw(st.lists(st.integers(3, max(3, size - 1)), max_size=3))
+    position[[row for row in masked if row < size]] = np.nan
+    joint = draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=n, max_size=n))
+    time = draw(st.sampled_from([0.0, 0.1, -5.0, 1.7e9])) + np.arange(size) / draw(
+        st.sampled_from([3, 100, 1000, 1024])
+    )
+    return recording_from_arrays(time, position, torque, **optional, joint=joint)
+
+
+def mapping_of_saved(recording: Recording) -> dict[str, Any]:
+    units = {
+        "revolute": {"position": "rad", "torque": "Nm", "velocity": "rad_s", "acceleration": "rad_s2"},
+        "prismatic": {"position": "m", "torque": "N", "velocity": "m_s", "acceleration": "m_s2"},
+    }
+    mapping: dict[str, Any] = {"time": "time_s", "joint": recording.joints}
+    for channel in CHANNELS:
+        values = getattr(recording, channel)
+        if values is not None:
+            numbers = range(1, values.shape[1] + 1) if values.shape[1] > 1 else [""]
+            kind = "position" if channel == "reference" else channel
+            suffixes = ["N" if channel == "force" else units[joint][kind] for joint in recording.joints]
+            mapping[channel] = [f"{channel}{k}_{suffix}" for k, suffix in zip(numbers, suffixes, strict=True)]
+    return mapping
+
+
+@pytest.mark.parametrize("extension", ["csv", "parquet"])
+@given(recording=recordings())
+@settings(max_examples=40, deadline=None, derandomize=True)
+def test_saved_recording_reads_back_equal(
+    tmp_path_factory: pytest.TempPathFactory, extension: str, recording: Recording
+) -> None:
+    folder = tmp_path_factory.mktemp("saved")
+    path = folder / f"a.{extension}"
+    save_recording(recording, path)
+    assert os.listdir(folder) == [path.name]
+    assert_equal(load_recording(path, **mapping_of_saved(recording)), recording)
+
+
+def test_saving_to_an_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
+    columns = signals()
+    with pytest.raises(ValueError, match=matches("use one of: .csv, .parquet")):
+        save_recording(recording_from_arrays(columns["t"], columns["q"], columns["tau"]), tmp_path / "a.xlsx")
+    assert os.listdir(tmp_path) == []
+
+
+# --- sampling ---------------------------------------------------------------------------------------------------------
+
+
+@given(
+    size=st.integers(10, 200),
+    rate=st.sampled_from([1.0, 60.0, 1000.0, 1024.0, 2000 / 3]),
+    start=st.sampled_from([0.0, -3.3, 1.7e9]),
+    data=st.data(),
+)
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_missing_rows_are_masked_and_the_others_unchanged(
+    size: int, rate: float, start: float, data: st.DataObject
+) -> None:
+    inner = st.integers(1, size - 2)
+    missing = data.draw(st.sets(inner, max_size=size // 4))
+    kept = np.setdiff1d(np.arange(size), list(missing))
+    t, q = start + np.arange(size) / rate, np.random.default_rng(0).normal(size=size)
+    recording = recording_from_arrays(t[kept], q[kept], -q[kept])
+    assert len(recording) == size
+    np.testing.assert_allclose(recording.time, t, rtol=0, atol=1e-3 / rate)
+    np.testing.assert_array_equal(np.flatnonzero(recording.valid), kept)
+    np.testing.assert_array_equal(recording.position[kept, 0], q[kept])
+    assert np.isnan(recording.torque[~recording.valid]).all()
+    assert len(recording.notes) == bool(missing)
+
+
+@pytest.mark.parametrize(
+    ("rate", "digits", "noted"),
+    [
+        pytest.param(1000, 3, False, id="1kHz-to-ms"),
+        pytest.param(1024, 6, False, id="1024Hz-to-us"),
+        pytest.param(1024, 4, True, id="1024Hz-to-0.1ms"),
+        pytest.param(100.4, 3, True, id="100.4Hz-to-ms"),
+        pytest.param(600, 3, True, id="600Hz-to-ms"),
+    ],
+)
+def test_rounded_stamps_are_even(rate: float, digits: int, noted: bool) -> None:
+    t = np.arange(100_000) / rate
+    recording = recording_from_arrays(np.round(t, digits), np.sin(t), np.cos(t))
+    np.testing.assert_array_equal(recording.position[:, 0], np.sin(t))
+    assert recording.sample_rate == pytest.approx(rate, rel=1e-6)
+    assert recording.valid.all()
+    assert [note for note in recording.notes if "rounded to" in note] == list(recording.notes)
+    assert len(recording.notes) == noted
+
+
+def test_stamps_rounded_until_they_repeat_point_to_the_sample_rate() -> None:
+    t = np.round(np.arange(1000) / 1024, 3)
+    with pytest.raises(ValueError, match=matches("row 23: the time stamp 0.021 s repeats the one before")) as caught:
+        recording_from_arrays(t, np.sin(t), np.cos(t))
+    assert "give 'sample_rate' instead" in str(caught.value)
+
+
+def test_small_jitter_is_not_interpolated() -> None:
+    k = np.arange(1000)
+    t = 0.005 * k + np.random.default_rng(0).uniform(-4e-5, 4e-5, 1000)
+    recording = recording_from_arrays(t, np.sin(t), np.cos(t))
+    np.testing.assert_array_equal(recording.position[:, 0], np.sin(t))
+    np.testing.assert_allclose(np.diff(recording.time), recording.time[1] - recording.time[0], rtol=1e-9)
+    assert recording.notes == ()
+
+
+def test_uneven_sampling_is_interpolated_and_gaps_are_masked() -> None:
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.8e-3, 1.2e-3, 5000))
+    t[3000:] += 0.5
+    recording = recording_from_arrays(t, np.sin(8 * t), np.cos(8 * t))
+    grid, valid = recording.time, recording.valid
+    median = np.median(np.diff(t))
+    np.testing.assert_allclose(np.diff(grid), median, rtol=1e-3)
+    np.testing.assert_array_equal(valid, (grid <= t[2999]) | (grid >= t[3000]))
+    error = np.abs(recording.position[:, 0] - np.sin(8 * grid))[valid]
+    assert np.quantile(error, 0.99) < 1e-5
+    assert error.max() < 2e-3  # beside the gap, where the slope is not known
+    uneven, gap = recording.notes
+    assert re.match(
+        r"the sampling is uneven \(4999 intervals from 0\.0008\S* to 0\.50\S* s\): resampled .* Hz$", uneven
+    )
+    assert re.match(
+        r"1 gap in the time stamps \(longest 0\.50\S* s, after row 3000\): the samples inside are masked$", gap
+    )
+
+
+@pytest.mark.parametrize("jitter", [0.0, 2e-4], ids=["even", "uneven"])
+def test_nan_is_masked_and_counted(jitter: float) -> None:
+    t = np.arange(100) / 100 + jitter * np.sin(np.arange(100))
+    q, tau = np.sin(5 * t), np.cos(5 * t)
+    q[[0, 50]], tau[50:53] = np.nan, np.nan
+    recording = recording_from_arrays(t, q, tau)
+    grid = recording.time
+    unmeasured = (grid < t[1] - 1e-9) | ((grid > t[49] + 1e-9) & (grid < t[53] - 1e-9))
+    np.testing.assert_array_equal(~recording.valid, unmeasured)
+    assert np.isnan(recording.torque[unmeasured]).all()
+    assert "4 of 100 samples are masked because of NaN in 'position' (2), 'torque' (3)" in recording.notes
+    assert len(recording.notes) == 1 + (jitter > 0)
+
+
+def test_one_resting_joint_is_noted() -> None:
+    t = np.arange(100) / 100
+    recording = recording_from_arrays(t, np.c_[np.sin(t), 0.3 + 0 * t], np.c_[np.sin(t), np.cos(t)])
+    assert recording.notes == ("column 'position[2]' is constant (0.3): the joint did not move",)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def changed(**columns: Any) -> dict[str, Any]:
+    """The signals with single values replaced: `q={3: nan}`, or whole columns."""
+    table: dict[str, Any] = {name: values.tolist() for name, values in signals().items()}
+    for name, change in columns.items():
+        if isinstance(change, dict):
+            for row, value in change.items():
+                table[name][row] = value
+        else:
+            table[name] = list(change)
+    return table
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        pytest.param(changed(t={7: 0.06}), "'t', row 8: the time stamp 0.06 s repeats the one before", id="repeated"),
+        pytest.param(changed(t={7: 0.01}), "'t', row 8: the time stamp 0.01 s steps backwards", id="backwards"),
+        pytest.param(changed(t={7: NAN}), "'t', row 8: the time stamp is nan", id="nan-time"),
+        pytest.param(changed(t={7: INF}), "'t', row 8: the time stamp is inf", id="inf-time"),
+        pytest.param(changed(q={2: INF}), "column 'q', row 3: the value is infinite", id="inf"),
+        pytest.param(changed(q=[NAN] * 50), "column 'q' is NaN throughout", id="all-nan"),
+        pytest.param(changed(q=[NAN] * 48 + [1, 2]), "only 2 of 50 samples are usable", id="nearly-all-nan"),
+        pytest.param(changed(q=[0.25] * 50), "column 'q' is constant (0.25): the joint did not move", id="resting"),
+        pytest.param(changed(tau=[0] * 50), "column 'tau' is constant (0): nothing was measured", id="dead-sensor"),
+        pytest.param(
+            changed(t={49: 1e9}), "after row 49 would fill the uniform grid with more than 50", id="hostile-gap"
+        ),
+        pytest.param(changed(t=np.arange(50) * 1e-320), "correct the unit of time", id="impossible-rate"),
+        pytest.param(changed(tau={4: "1,5"}), "is not a number", id="decimal-comma"),
+        pytest.param(changed(tau={4: "broken"}), "column 'tau', row 5: 'broken' is not a number", id="text"),
+        pytest.param(changed(tau={4: "1_0"}), "column 'tau', row 5: '1_0' is not a number", id="underscore"),
+        pytest.param(changed(tau={4: "1,5,6"}), "row 5 has 5 fields, the header 3", id="ragged"),
+        pytest.param({"t": [], "q": [], "tau": []}, "has 0 samples; at least 3 are needed", id="header-only"),
+        pytest.param({"t": [0, 1], "q": [0, 1], "tau": [0, 1]}, "has 2 samples; at least 3", id="too-short"),
+        pytest.param({"t": [0], "angle": [0], "tau": [0]}, "column 'q' is not there; there are: 't',", id="no-column"),
+    ],
+)
+def test_bad_data(tmp_path: Path, columns: dict[str, Any], message: str) -> None:
+    delimiter = ";" if "1,5" in columns["tau"] else ","
+    path = write_csv(tmp_path / "a.csv", columns, delimiter)
+    with pytest.raises(ValueError, match=matches(message)) as caught:
+        load_recording(path, **MAPPING)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        pytest.param({"position": "q_1"}, "column 'q_1' is not there; did you mean 'q1'?", id="nearest-column"),
+        pytest.param({"time": None}, "give either 'time' (a column) or 'sample_rate'", id="no-clock"),
+        pytest.param({"sample_rate": 100}, "give either 'time' (a column) or 'sample_rate'", id="two-clocks"),
+        pytest.param({"time": None, "sample_rate": 0}, "sample_rate must be one positive number", id="zero-rate"),
+        pytest.param({"time": None, "sample_rate": "q1"}, "sample_rate must be one positive number", id="vector-rate"),
+        pytest.param({"time": ["t", "q1"]}, "time has 2 columns", id="two-times"),
+        pytest.param({"position": None}, "position: None names no column", id="no-position"),
+        pytest.param({"position": 3}, "position: 3 names no column", id="number-for-a-column"),
+        pytest.param({"position": []}, "position: [] names no column", id="empty-list"),
+        pytest.param({"position": {"column": "q1", "unti": "deg"}}, "did you mean 'unit'?", id="unknown-key"),
+        pytest.param({"time": {"column": "t", "sign": -1}}, "time: unknown key 'sign'", id="sign-of-time"),
+        pytest.param({"position": {"column": "q1", "unit": 1}}, "position: the unit must be text", id="unit-type"),
+        pytest.param({"position": {"column": "q1", "unit": "dge"}}, "position: unknown unit 'dge'", id="unknown-unit"),
+        pytest.param({"position": {"column": "q1", "unit": "9**9**9"}}, "unknown unit '9**9**9'", id="hostile-unit"),
+        pytest.param({"position": {"column": "q1", "unit": "mm"}}, "'mm' does not convert to 'rad'", id="length"),
+        pytest.param({"velocity": {"column": "q1", "unit": "Hz"}}, "'Hz' does not convert to 'rad/s'", id="hertz"),
+        pytest.param({"torque": {"column": "q1", "gain": "3 N/V"}}, "does not convert to 'N m'", id="gain-unit"),
+        pytest.param({"torque": {"column": "q1", "gain": "__import__('os')"}}, "is not a number", id="gain-text"),
+        pytest.param({"torque": {"column": "q1", "gain": 0}}, "is not a number other than 0", id="gain-zero"),
+        pytest.param({"torque": {"column": "q1", "sign": 2}}, "sign must be 1 or -1, not 2", id="sign"),
+        pytest.param({"gear_ratio": 0}, "gear_ratio must be a positive number, not 0", id="gear-zero"),
+        pytest.param({"gear_ratio": "6"}, "gear_ratio must be a positive number, not '6'", id="gear-text"),
+        pytest.param({"joint": "revolut"}, "did you mean 'revolute'?", id="joint"),
+        pytest.param({"joint": ["revolute"] * 2}, "2 types for 1 position columns", id="joint-count"),
+        pytest.param({"velocity": ["q1", "tau"]}, "velocity has 2 columns for 1 joints", id="joint-columns"),
+        pytest.param({"position": "knee_deg"}, 'state the unit: position = {column = "knee_deg"', id="suffix"),
+        pytest.param({"velocity": "knee_rad"}, "'knee_rad' says 'rad', but without a unit", id="suffix-rad"),
+        pytest.param({"position": "short"}, "'t' has 50 samples, but 'short' has 40", id="lengths"),
+        pytest.param({"position": ["q1", "short"]}, "'q1' has 50 samples, but 'short' has 40", id="lengths-in-list"),
+        pytest.param({"position": "words"}, "'words' does not hold real numbers", id="text-variable"),
+        pytest.param({"position": "cube"}, "'cube' has shape (50, 1, 1)", id="three-dimensional"),
+    ],
+)
+def test_bad_mapping(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    columns = signals()
+    q = columns.pop("q")
+    more = {"knee_deg": q, "knee_rad": q, "short": q[:40], "words": np.array(["a"] * 50), "cube": q[:, None, None]}
+    np.savez(tmp_path / "a.npz", **columns, q1=q, **more)
+    mapping = {"time": "t", "position": "q1", "torque": "tau"}
+    with pytest.raises(ValueError, match=matches(message)):
+        load_recording(tmp_path / "a.npz", **(mapping | change))
+
+
+@pytest.mark.parametrize("suffix", ["mrad", "rad"])
+def test_a_stated_unit_wins_over_the_name(tmp_path: Path, suffix: str) -> None:
+    columns = signals()
+    np.savez(tmp_path / "a.npz", **columns, **{f"x_{suffix}": columns["q"]})
+    entry = {"column": f"x_{suffix}", "unit": "deg"}
+    recording = load_recording(tmp_path / "a.npz", **(MAPPING | {"position": entry}))
+    np.testing.assert_allclose(recording.position[:, 0], columns["q"] * DEG)
+
+
+@pytest.mark.parametrize(
+    ("file", "write"),
+    [("a.parquet", parquet), ("a.mat", row_vector_mat), ("a.mat", new_mat), ("a.h5", hdf5), ("a.npz", npz)],
+    ids=["parquet", "mat-v5", "mat-v7.3", "hdf5", "npz"],
+)
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.7])
+def test_damaged_files(tmp_path: Path, file: str, write: Callable[..., dict[str, Any]], kept: float) -> None:
+    path = tmp_path / file
+    mapping = write(path, signals(2000))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    # A MATLAB v5 file that ends early can look like one with fewer variables.
+    with pytest.raises(ValueError, match=r"\A[^\n]*(cannot be read as|is not there)[^\n]*\Z") as caught:
+        load_recording(path, **mapping)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **signals() | {"q": np.array([{}] * 50)})
+    with pytest.raises(ValueError, match=matches("holds Python objects, which are never unpickled")):
+        load_recording(tmp_path / "a.npz", **MAPPING)
+
+
+def test_other_bad_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=matches("there is no such file")):
+        load_recording(tmp_path / "absent.csv", **MAPPING)
+    (tmp_path / "a.xlsx").write_bytes(b"")
+    with pytest.raises(ValueError, match=matches("use one of: .csv, .txt, .tsv, .parquet, .mat")):
+        load_recording(tmp_path / "a.xlsx", **MAPPING)
+    (tmp_path / "empty.csv").write_bytes(b"")
+    with pytest.raises(ValueError, match=matches("is empty; the first line must name the columns")):
+        load_recording(tmp_path / "empty.csv", **MAPPING)
+    (tmp_path / "noise.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(ValueError, match=matches("is not UTF-8 text")):
+        load_recording(tmp_path / "noise.csv", **MAPPING)
+    (tmp_path / "latin.csv").write_bytes("t,q°,tau\n".encode("latin1"))
+    with pytest.raises(ValueError, match=matches("is not UTF-8 text; save it with that encoding")):
+        load_recording(tmp_path / "latin.csv", **MAPPING)
+    (tmp_path / "twice.csv").write_text("t,q,q,tau\n0,1,2,3\n")
+    with pytest.raises(ValueError, match=matches("column 'q' appears more than once")):
+        load_recording(tmp_path / "twice.csv", **MAPPING)
+    pyarrow.parquet.write_table(pyarrow.table({"t": ["a"], "q": [1], "tau": [1]}), tmp_path / "text.parquet")
+    with pytest.raises(ValueError, match=matches("column 't' holds string, not numbers")):
+        load_recording(tmp_path / "text.parquet", **MAPPING)
+
+
+@given(content=st.binary(max_size=200), extension=st.sampled_from(["csv", "parquet", "mat", "h5", "npz"]))
+@settings(max_examples=150, deadline=None, derandomize=True)
+def test_arbitrary_bytes_give_one_line(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes, extension: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"noise.{extension}"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"\A[^\n]*\Z"):
+        load_recording(path, **MAPPING)
+
+
+# --- the table of a job file ------------------------------------------------------------------------------------------
+
+
+def test_mapping_of_a_job_file(tmp_path: Path) -> None:
+    columns = signals()
+    write_csv(tmp_path / "run.csv", columns)
+    recording = recording_from_mapping({"file": "run.csv", **MAPPING}, tmp_path)
+    assert_equal(recording, recording_from_arrays(columns["t"], columns["q"], columns["tau"]))
+    assert recording.name == "run"
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        pytest.param(
+            {"file": "a.csv", "positon": "q"}, "unknown key 'positon'; did you mean 'position'?", id="unknown"
+        ),
+        pytest.param({"position": "q", "torque": "tau"}, "'file' is missing", id="no-file"),
+        pytest.param({"file": "a.csv", "position": "q"}, "'torque' is missing", id="no-torque"),
+        pytest.param({"file": 1, "position": "q", "torque": "tau"}, "'file' must be a path in quotes", id="file-type"),
+    ],
+)
+def test_bad_tables(tmp_path: Path, table: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=matches(message)):
+        recording_from_mapping(table, tmp_path)
+
+
+# --- real recordings --------------------------------------------------------------------------------------------------
+
+
+def test_emps(data_folder: Path) -> None:
+    drive = {"column": "vir", "unit": "V", "gain": "35.1507 N/V"}
+    path = data_folder / "emps" / "DATA_EMPS.mat"
+    recording = load_recording(path, joint="prismatic", time="t", position="qm", reference="qg", torque=drive)
+    assert recording.position.shape == recording.torque.shape == (24841, 1)
+    assert recording.sample_rate == pytest.approx(1000, rel=1e-6)
+    assert recording.notes == ()
+    raw = scipy.io.loadmat(path)
+    np.testing.assert_allclose(recording.torque, 35.1507 * raw["vir"], rtol=1e-14)
+
+
+def test_ankle(data_folder: Path) -> None:
+    channels: dict[str, Any] = {"position": "position_rad", "torque": {"column": "torque_Nm", "sign": -1}}
+    clean = load_recording(data_folder / "ankle" / "z_df2.csv", time="time_s", **channels)
+    assert (len(clean), clean.sample_rate, clean.notes) == (60000, pytest.approx(1000), ())
+    assert clean.torque[0, 0] == 2.93377161
+    reflex = load_recording(data_folder / "ankle" / "z_pf.npz", sample_rate="sample_rate_Hz", **channels)
+    assert (len(reflex), reflex.sample_rate, reflex.notes) == (60000, pytest.approx(1000), ())
+
+
+def test_double_pendulum(data_folder: Path) -> None:
+    files = sorted((data_folder / "double_pendulum").glob("*.csv"))
+    assert len(files) == 4
+    columns = {"position": ["pos1", "pos2"], "torque": ["tau1", "tau2"], "velocity": ["vel1", "vel2"]}
+    for file in files:
+        recording = load_recording(file, time="time", **columns)
+        assert recording.n_joints == 2
+        assert recording.sample_rate == pytest.approx(200, rel=1e-3)
+        assert recording.valid.all()

@@ -1,0 +1,139 @@
+"""Report, summary and table: complete, self-contained, and silent where nothing can be trusted."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from test_plots import JOB, identified, recording, without_trust
+
+from jaximp import report
+from jaximp.identify import Estimates
+from jaximp.job import Job, parse_job
+from jaximp.types import Recording
+
+NASTY = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def case() -> tuple[Job, Recording, Estimates]:
+    return parse_job(JOB + "# <b>bold</b>\n"), recording(name=NASTY), identified()
+
+
+@pytest.fixture(scope="module")
+def folder(case: tuple[Job, Recording, Estimates], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    job, source, estimates = case
+    out = tmp_path_factory.mktemp("results")
+    report.write_results(out, [estimates, replace(estimates, method=3)], [estimates], job, source)
+    return out
+
+
+def strict(text: str) -> Any:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_all_files_are_there(folder: Path) -> None:
+    figures = {"parameters", "torque", "condition", "residual_spectrum", "window_lengths", "methods"}
+    tables = {"estimates.parquet", "estimates_method3.parquet", "summary.json", "report.html"}
+    assert {path.name for path in folder.iterdir()} == tables | {f"{name}.png" for name in figures}
+
+
+def test_report_needs_nothing_else(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|<link|<script|@import|url\(", page)
+    sources = re.findall(r'src="([^"]{30})', page)
+    assert len(sources) == 6
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert len(page) < 2_000_000
+
+
+def test_report_escapes_what_it_is_given(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert NASTY not in page
+    assert "&lt;script&gt;" in page
+    assert "&lt;b&gt;bold" in page
+
+
+def test_report_closes_every_tag(folder: Path) -> None:
+    opened: list[str] = []
+
+    class Balance(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            if tag not in ("meta", "img", "br"):
+                opened.append(tag)
+
+        def handle_endtag(self, tag: str) -> None:
+            assert opened.pop() == tag
+
+    Balance().feed((folder / "report.html").read_text(encoding="utf-8"))
+    assert not opened
+
+
+def test_report_gives_the_answer_before_the_figures(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.index("95 % interval") < page.index("What to do") < page.index("<figure>") < page.index("<pre>")
+    assert "No window can be trusted" not in page
+
+
+def test_summary_is_strict_json_and_right(folder: Path) -> None:
+    content = strict((folder / "summary.json").read_text(encoding="utf-8"))
+    assert content["parameters"]["stiffness"]["mean"] == pytest.approx(60, rel=0.02)
+    assert content["parameters"]["stiffness"]["unit"] == "N m/rad"
+    assert content["equilibrium"]["equilibrium"]["median"] == pytest.approx(0.01, rel=0.05)
+    assert content["windows"]["count"] == sum(v["count"] for v in content["windows"]["verdicts"].values())
+    assert content["at_joint"] is None
+    assert content["threshold"] is None
+    assert [result["method"] for result in content["further_methods"]] == [3]
+    assert len(content["window_lengths"]) == 1
+    assert set(content["versions"]) == {"jaximp", "jax", "numpy"}
+
+
+def test_summary_gives_values_at_the_joint(case: tuple[Job, Recording, Estimates]) -> None:
+    _, source, estimates = case
+    geared = parse_job(JOB.replace("offset = true", "offset = true, gear_ratio = 10"))
+    content = report.summary([estimates], geared, source)
+    joint, motor = content["at_joint"]["parameters"], content["parameters"]
+    for name, factor in {"inertia": 100, "damping": 100, "stiffness": 100, "offset_torque": 10}.items():
+        assert joint[name]["mean"] == pytest.approx(factor * motor[name]["mean"])
+        assert joint[name]["half_width_95"] == pytest.approx(factor * motor[name]["half_width_95"])
+    at_motor = content["equilibrium"]["equilibrium"]["median"]
+    assert content["at_joint"]["equilibrium"]["equilibrium"]["median"] == pytest.approx(at_motor / 10)
+
+
+def test_table_has_columns_units_and_the_job(folder: Path, case: tuple[Job, Recording, Estimates]) -> None:
+    job, _, estimates = case
+    table = pq.read_table(folder / "estimates.parquet")
+    expected = ["start_s", "end_s", "condition", "sigma_min", "residual_rms", "vaf", "held_out_vaf", "dof", "samples"]
+    parameters = [column for name in estimates.names for column in (name, f"{name}_stderr")]
+    assert set(table.column_names) == {*expected, *parameters, "equilibrium", "verdict", "reason"}
+    assert len(table) == len(estimates.end)
+    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    assert units["stiffness"] == units["stiffness_stderr"] == "N m/rad"
+    assert units["start_s"] == "s"
+    assert units["equilibrium"] == "rad"
+    assert units["residual_rms"] == "N m"
+    assert table.schema.metadata[b"job"].decode() == job.text
+    np.testing.assert_array_equal(table["stiffness"].to_numpy(), np.asarray(estimates.fit.theta)[:, 2])
+    assert table["verdict"].to_pylist() == estimates.verdicts.verdict.tolist()
+
+
+def test_no_trusted_window_is_said_before_any_number(case: tuple[Job, Recording, Estimates], tmp_path: Path) -> None:
+    job, source, estimates = case
+    report.write_results(tmp_path, [without_trust(estimates)], [], job, source)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.index("No window can be trusted") < page.index("<table")
+    answer = page[page.index("<table") : page.index("</table>")]
+    assert not re.search(r"<td[^>]*>[^<]*\d", re.sub(r'<td class="text">[^<]*</td>', "", answer))
+    content = strict((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert content["windows"]["trusted"] == 0
+    assert content["parameters"]["stiffness"]["mean"] is None
