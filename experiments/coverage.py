@@ -21,7 +21,7 @@ from scipy.stats import t as student
 from jaximp import signals
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import HumanJoint
-from jaximp.simulation.rig import PAPER_TRAJECTORY, HumanLoad, Rig, simulate_rig
+from jaximp.simulation.rig import ROBOT_TRAJECTORY, HumanLoad, Rig, simulate_rig
 
 jax.config.update("jax_enable_x64", True)
 
@@ -39,7 +39,7 @@ Numbers = NDArray[np.float64]
 def motion(quantised: bool) -> tuple[Numbers, Numbers]:
     """Measured position (N,) and the human's true torque (N,)."""
     human = HumanLoad(stiffness=1e-3, stiffness_after=1e-3, inertia=2e-6, damping=3e-5)
-    simulated = simulate_rig(Rig(), PAPER_TRAJECTORY, 12.0, human)
+    simulated = simulate_rig(Rig(), ROBOT_TRAJECTORY, 12.0, human)
     return np.asarray(simulated.position if quantised else simulated.true_position), np.asarray(simulated.human_torque)
 
 

@@ -82,7 +82,7 @@ def condition(columns: Columns, trajectory: FourierSeries) -> float:
 
 
 if __name__ == "__main__":
-    for name, columns, order in (("PAPER_TRAJECTORY", robot_columns, 5), ("BANDS_TRAJECTORY", human_columns, 7)):
+    for name, columns, order in (("ROBOT_TRAJECTORY", robot_columns, 5), ("HUMAN_TRAJECTORY", human_columns, 7)):
         best, reached = design(columns, order, starts=100, seed=0)
         at_best = condition(columns, series(best, order))
         print(f"{name}: condition {at_best:.3f}, median {np.median(reached):.3f} of 100 starts")

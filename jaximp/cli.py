@@ -164,14 +164,17 @@ def _run_job(job, out: Path, force: bool) -> None:  # type: ignore[no-untyped-de
 
 
 def _identify_into(job, folder: Path) -> None:  # type: ignore[no-untyped-def]
-    from jaximp.identify import at_other_lengths, identify_recording
+    from jaximp.identify import at_other_lengths, in_windows, prepare
     from jaximp.report import write_results
 
     with _progress("identifying") as progress:
         recording, alone = job.load(), job.load_robot_alone()
         progress(0.1)
-        estimates = identify_recording(job, recording, alone, lambda share: progress(0.1 + 0.4 * share))
-        others = at_other_lengths(job, recording, alone, lambda share: progress(0.5 + 0.3 * share))
+        prepared = prepare(job, recording, alone)
+        progress(0.3)
+        estimates = in_windows(job, prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
+        others = at_other_lengths(job, prepared, alone)
+        progress(0.8)
         write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
         progress(1.0)
     counts = {name: count for name, count in estimates[0].verdicts.counts().items() if count}

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
@@ -87,20 +88,100 @@ def identify_recording(
     job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> list[Estimates]:
     """As `identify`, for recordings that are in memory."""
+    prepared = prepare(job, recording, alone)
+    progress(0.3)
+    return in_windows(job, prepared, lambda share: progress(0.3 + 0.7 * share))
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """What methods 1 to 4 need beside the rows of the robot with the human."""
+
+    robot: Model
+    robot_fit: WindowFit
+    alone: Regression
+    loaded: Regression
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A filtered recording: what windows of any length share (but for filters inside every window)."""
+
+    recording: Recording
+    model: Model
+    """What is identified in the windows: the human where there is one, else the robot."""
+    filters: Filters
+    rows: Rows
+    noise: Array | None
+    """What the filters make of white torque noise, see `noise_of_rows`."""
+    column_noise: NDArray[np.float64]
+    """(p,) what noise of the position leaves in each column."""
+    pair: _Pair | None
+
+
+def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
+    """Filter the recordings of a job."""
     signals.require_float64(recording.position)
     robot, human = job.models(recording.joints)
-    if robot is not None and human is not None:
-        return _identify_human(job, recording, alone, robot, human, progress)
+    filters = design_filters(job.filter, recording.sample_rate)
+    noise = noise_of_rows(job, recording, filters)
     model = robot if human is None else human
     assert model is not None
-    filters = design_filters(job.filter, recording.sample_rate)
-    rows = regress(model, recording, job, filters)
-    place = windows_in_rows(job, recording, rows, filters)
-    noise = noise_of_rows(job, recording, filters)
-    valid = jnp.asarray(rows.valid)
-    fit = sliding_least_squares(rows.W, rows.torque, place.window, place.step, valid=valid, noise=noise)
-    progress(0.7)
-    return [_estimates(job, recording, filters, model, rows, fit, place)]
+    if robot is None or human is None:
+        rows, pair = regress(model, recording, job, filters), None
+    else:
+        rows, pair = _prepare_pair(job, recording, alone, robot, human, filters)
+    return Prepared(recording, model, filters, rows, noise, column_noise(model, recording, filters), pair)
+
+
+def in_windows(
+    job: Job, prepared: Prepared, progress: Progress = lambda share: None, longest: float | None = None
+) -> list[Estimates]:
+    """Solve and judge every window of a prepared recording, by every method that the job asks for.
+
+    **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code.
+    """
+    rows, noise = prepared.rows, prepared.noise
+    place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
+    if prepared.pair is None:
+        valid = jnp.asarray(rows.valid)
+        fit = sliding_least_squares(
+            rows.W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=place.room
+        )
+        return [_estimates(job, prepared, rows, fit, place)]
+    pair = prepared.pair
+    merge = combine(pair.robot, prepared.model).merge
+    results = []
+    for count, method in enumerate(job.model.methods):
+        found = separate(
+            method, pair.robot_fit, pair.alone, pair.loaded, merge, place.window, place.step, noise, place.room
+        )
+        n = len(found.torque)
+        human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
+        estimates = _estimates(job, prepared, human, found.fit, place, METHODS[method], found.warning)
+        results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
+        progress((count + 1) / len(job.model.methods))
+    return results
+
+
+def at_other_lengths(
+    job: Job, prepared: Prepared, alone: Recording | None = None, factors: tuple[float, ...] = (0.5, 2.0)
+) -> list[Estimates]:
+    """The same data with shorter and longer windows, so that the choice of a length can be seen.
+
+    Lengths that the recording or the filters do not allow are left out.
+    """
+
+    def identified(factor: float) -> list[Estimates]:
+        window = replace(job.window, length=factor * job.window.length, step=step_seconds(job))
+        other = replace(job, window=window, model=replace(job.model, methods=job.model.methods[:1]))
+        with suppress(ValueError):
+            once = job.filter.mode == "once"
+            shared = prepared if once else prepare(other, prepared.recording, alone)
+            return in_windows(other, shared, longest=max(factors) * job.window.length)
+        return []
+
+    return [estimates for factor in factors for estimates in identified(factor)]
 
 
 def regress_both(
@@ -112,30 +193,17 @@ def regress_both(
     return Regression(rows.W[:, :n], rows.W[:, n:], rows.torque, jnp.asarray(rows.valid)), rows
 
 
-def _identify_human(
-    job: Job, recording: Recording, alone: Recording | None, robot: Model, human: Model, progress: Progress
-) -> list[Estimates]:
-    """The human in the robot, by every method that the job asks for."""
+def _prepare_pair(
+    job: Job, recording: Recording, alone: Recording | None, robot: Model, human: Model, filters: Filters
+) -> tuple[Rows, _Pair]:
     alone = _checked_pair(recording, alone)
-    filters = design_filters(job.filter, recording.sample_rate)
     # The robot's own parameters come from its whole recording, which needs no windows.
     once = replace(job, filter=replace(job.filter, mode="once"))
     whole = regress_both(robot, human, alone, once, filters)[0]
     robot_fit = fit_robot(whole, noise_of_rows(once, alone, filters))
     in_windows = whole if job.filter.mode == "once" else regress_both(robot, human, alone, job, filters)[0]
     loaded, rows = regress_both(robot, human, recording, job, filters)
-    place = windows_in_rows(job, recording, rows, filters)
-    noise, merge = noise_of_rows(job, recording, filters), combine(robot, human).merge
-    results = []
-    for count, method in enumerate(job.model.methods):
-        found = separate(method, robot_fit, in_windows, loaded, merge, place.window, place.step, noise)
-        n = len(found.torque)
-        part = Rows(loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
-        notes = METHODS[method], found.warning
-        estimates = _estimates(job, recording, filters, human, part, found.fit, place, *notes)
-        results.append(replace(estimates, method=method, robot=robot_fit, robot_names=robot.names))
-        progress((count + 1) / len(job.model.methods))
-    return results
+    return rows, _Pair(robot, robot_fit, in_windows, loaded)
 
 
 def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
@@ -151,26 +219,20 @@ def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
     return alone
 
 
-def _estimates(
-    job: Job,
-    recording: Recording,
-    filters: Filters,
-    model: Model,
-    rows: Rows,
-    fit: SlidingFit,
-    place: Placement,
-    *notes: str,
-) -> Estimates:
+def _estimates(job: Job, prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement, *notes: str) -> Estimates:
     """Judge the windows of a fit and predict what they have not seen."""
+    recording, model = prepared.recording, prepared.model
     starts, ahead = place.starts[: len(fit.last)], jnp.asarray(place.next_starts[: len(fit.last)])
-    held_out = held_out_vaf(rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta, ahead, place.window)
+    held_out = held_out_vaf(
+        rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta, ahead, place.window, place.room or place.window
+    )
     threshold, why_not = _threshold(job, recording, model)
     verdicts = judge(
         fit,
         model.names,
         place.counted * recording.n_joints,
         _parameter_scale(rows),
-        column_noise(model, recording, job, filters, rows),
+        prepared.column_noise,
         threshold,
         job.trust,
     )
@@ -267,24 +329,3 @@ def equilibrium(estimates: Estimates, human: Model) -> NDArray[np.float64] | Non
     if not isinstance(human, HumanJoint) or not human.offset:
         return None
     return np.asarray(human.equilibrium(jnp.asarray(estimates.fit.theta)))
-
-
-def at_other_lengths(
-    job: Job,
-    recording: Recording,
-    alone: Recording | None = None,
-    progress: Progress = lambda share: None,
-    factors: tuple[float, ...] = (0.5, 2.0),
-) -> list[Estimates]:
-    """The same data with shorter and longer windows, so that the choice of a length can be seen.
-
-    Lengths that the recording or the filters do not allow are left out.
-    """
-    found = []
-    for count, factor in enumerate(factors):
-        window = replace(job.window, length=factor * job.window.length, step=step_seconds(job))
-        methods = replace(job.model, methods=job.model.methods[:1])
-        with suppress(ValueError):
-            found.append(identify_recording(replace(job, window=window, model=methods), recording, alone)[0])
-        progress((count + 1) / len(factors))
-    return found

@@ -6,6 +6,9 @@ regressions: rows of the robot's and the human's model, and the motor's torque.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -70,43 +73,43 @@ def separate(
     merge: tuple[tuple[float, ...], ...],
     window: int,
     step: int = 1,
-    noise: Num[AnyArray, " L"] | None = None,
+    noise: Num[AnyArray, "..."] | None = None,
+    room: int | None = None,
 ) -> Separation:
     """Identify the human by one of the four methods.
 
     **Arguments:** `robot`, the fit of the robot alone (`fit_robot`); `alone` (R) and `loaded` (RH); `merge`, the map
-    of `models.combine(robot, human)` that method 2 needs; `window`, `step` and `noise` as in
-    `sliding_least_squares`, in rows of the regressions.
+    of `models.combine(robot, human)` that method 2 needs; `window`, `step`, `noise` and `room`
+    as in `sliding_least_squares`, in rows of the regressions.
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: the paper has methods 1, 2, 3 and 4")
+    slide = partial(sliding_least_squares, window=window, step=step, noise=noise, room=room)
     torque = loaded.torque - loaded.robot @ robot.theta
     if method == 1:
-        fit = _robot_first(robot, loaded, torque, window, step, noise)
+        fit = _robot_first(robot, loaded, torque, slide)
         return Separation(fit, torque)
     if method == 2:
-        fit = _difference_of_parameters(robot, loaded, merge, window, step, noise)
+        fit = _difference_of_parameters(robot, loaded, merge, slide)
         return Separation(fit, torque)
     alone, loaded, shorter = _same_length(alone, loaded)
     if method == 3:
         torque = loaded.torque - alone.torque
         valid = alone.valid & loaded.valid
-        fit = sliding_least_squares(loaded.human, torque, window, step, valid=valid, noise=noise)
+        fit = slide(loaded.human, torque, valid=valid)
         return Separation(
             fit, torque, "; ".join(filter(None, [_motions_differ(robot, alone, loaded, torque), shorter]))
         )
-    fit = _augmented(alone, loaded, window, step, noise)
+    fit = _augmented(alone, loaded, slide)
     return Separation(fit, torque[: len(loaded.torque)], shorter)
 
 
-def _robot_first(
-    robot: WindowFit, loaded: Regression, torque: Array, window: int, step: int, noise: Array | None
-) -> SlidingFit:
+def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: Callable[..., SlidingFit]) -> SlidingFit:
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
-    fit = sliding_least_squares(loaded.human, torque, window, step, valid=loaded.valid, noise=noise)
+    fit = slide(loaded.human, torque, valid=loaded.valid)
 
     def response(column: Array) -> Array:
-        return sliding_least_squares(loaded.human, column, window, step, valid=loaded.valid).theta
+        return slide(loaded.human, column, valid=loaded.valid).theta
 
     passed_on = jax.lax.map(response, loaded.robot.T)  # (r, M, h)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
@@ -117,9 +120,7 @@ def _difference_of_parameters(
     robot: WindowFit,
     loaded: Regression,
     merge: tuple[tuple[float, ...], ...],
-    window: int,
-    step: int,
-    noise: Array | None,
+    slide: Callable[..., SlidingFit],
 ) -> SlidingFit:
     """Method 2. `merge` says which column of the merged model each parameter went into."""
     place = np.argmax(np.asarray(merge), axis=0)
@@ -127,7 +128,7 @@ def _difference_of_parameters(
     robot_place, human_place = place[:n_robot], place[n_robot:]
     both = jnp.concatenate([loaded.robot, loaded.human], axis=1)
     first_member = jnp.array([np.flatnonzero(row)[0] for row in np.asarray(merge)])
-    fit = sliding_least_squares(both[:, first_member], loaded.torque, window, step, valid=loaded.valid, noise=noise)
+    fit = slide(both[:, first_member], loaded.torque, valid=loaded.valid)
 
     shared = np.asarray(human_place)[:, None] == np.asarray(robot_place)[None, :]  # (h, r)
     robot_variance = jnp.diagonal(robot.covariance)
@@ -144,14 +145,14 @@ def _difference_of_parameters(
     return _with_inherited_variance(human, inherited, robot.dof)
 
 
-def _augmented(alone: Regression, loaded: Regression, window: int, step: int, noise: Array | None) -> SlidingFit:
+def _augmented(alone: Regression, loaded: Regression, slide: Callable[..., SlidingFit]) -> SlidingFit:
     """Method 4: the two recordings are two outputs that share the robot's parameters."""
     upper = jnp.concatenate([alone.robot, jnp.zeros_like(loaded.human)], axis=1)
     lower = jnp.concatenate([loaded.robot, loaded.human], axis=1)
     W = jnp.stack([upper, lower], axis=1)
     y = jnp.stack([alone.torque, loaded.torque], axis=1)
     valid = jnp.stack([alone.valid, loaded.valid], axis=1)
-    fit = sliding_least_squares(W, y, window, step, valid=valid, noise=noise)
+    fit = slide(W, y, valid=valid)
     n_robot = loaded.robot.shape[1]
     return eqx.tree_at(
         lambda f: (f.theta, f.stderr, f.excitation),

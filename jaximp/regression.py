@@ -228,6 +228,8 @@ class Placement:
     """Rows from one window to the next."""
     counted: int
     """Rows of a complete window that count."""
+    room: int | None
+    """Rows that the compiled code is to have room for, see `windows.sliding_least_squares`."""
     starts: NDArray[np.int64]
     """(M,) first row of each window."""
     next_starts: NDArray[np.int64]
@@ -235,7 +237,9 @@ class Placement:
     separate: bool
 
 
-def windows_in_rows(job: Job, recording: Recording, rows: Rows, filters: Filters) -> Placement:
+def windows_in_rows(
+    job: Job, recording: Recording, rows: Rows, filters: Filters, longest: float | None = None
+) -> Placement:
     """Find the windows of a job in the rows of a recording."""
     rate = recording.sample_rate
     if round(job.window.length * rate) > len(recording):
@@ -249,11 +253,12 @@ def windows_in_rows(job: Job, recording: Recording, rows: Rows, filters: Filters
         starts = np.arange(0, len(rows.time), block)
         ahead = -(-samples // round(step_seconds(job) * rate))
         counted = int(_away_from_ends(samples, filters, job.filter).sum())
-        return Placement(block, block, counted, starts, starts + ahead * block, separate=True)
+        return Placement(block, block, counted, None, starts, starts + ahead * block, separate=True)
     window = round(job.window.length * rate / filters.decimate)
     step = max(1, round(step_seconds(job) * rate / filters.decimate))
+    room = None if longest is None else max(window, round(longest * rate / filters.decimate))
     starts = window_starts(len(rows.time), window, step)
-    return Placement(window, step, window, starts, starts + window, separate=False)
+    return Placement(window, step, window, room, starts, starts + window, separate=False)
 
 
 def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | None:
@@ -265,7 +270,7 @@ def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | N
     return response @ response.T
 
 
-def column_noise(model: Model, recording: Recording, job: Job, filters: Filters, rows: Rows) -> NDArray[np.float64]:
+def column_noise(model: Model, recording: Recording, filters: Filters) -> NDArray[np.float64]:
     """(p,) root mean square that noise of the position leaves in each column: the pipeline, run on noise as well.
 
     The columns that jump (the sign of the velocity) are left out: the jumps say nothing of the joint's excitation.

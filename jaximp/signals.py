@@ -164,9 +164,9 @@ def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.fl
 
 def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[np.bool_]:
     """Also invalidate `by` samples on both sides of every gap, and at both ends: where a filter saw no measurement."""
-    gone = np.r_[ends, ~valid, ends].astype(np.int64)
-    near = np.convolve(gone, np.ones(2 * by + 1, dtype=np.int64))[by : by + len(gone)]
-    return (near == 0)[1:-1]
+    gone = np.cumsum(np.r_[np.zeros(by + 1), ends, ~valid, ends, np.zeros(by)])
+    near = gone[2 * by + 1 :] - gone[: -2 * by - 1]
+    return np.asarray(near == 0)[1:-1]
 
 
 def jumps(x: NDArray[np.float64]) -> NDArray[np.bool_]:

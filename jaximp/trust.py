@@ -24,6 +24,9 @@ class TrustLimits:
 
     min_vaf: float = 0.75
     """Share of the torque's variance that the model must explain."""
+    max_residual_ratio: float = 4.0
+    """Largest residual, as a multiple of the lower quartile over the excited windows: above it something happened that
+    the model does not know, such as a parameter that changes inside the window."""
     max_relative_stderr: float = 0.2
     """Largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
     min_excitation_ratio: float = 5.0
@@ -83,14 +86,14 @@ def judge(
        error is too large. The condition number alone cannot tell: on a still arm, noise builds a well conditioned
        regressor.
     3. *fake change*: the condition number is above the threshold of eqs. (16), (17), where one is given.
-    4. *poor fit*: the model explains too little of the torque.
+    4. *poor fit*: the model explains too little of the torque, or much less than in other windows.
 
     **Arguments:** `names` (p) of the parameters; `window_samples` torque samples in a full window;
     `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
     `column_noise` (p,) root mean square of each column that noise in the position alone gives.
     """
     theta, stderr, excitation = (np.asarray(x) for x in (fit.theta, fit.stderr, fit.excitation))
-    samples, cond, vaf = (np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf))
+    samples, cond, vaf, residual = (np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf, fit.residual_rms))
     with np.errstate(invalid="ignore", divide="ignore"):
         error = stderr / np.maximum(np.abs(theta), parameter_scale)
         built_by_noise = np.sqrt(samples)[:, None] * column_noise
@@ -131,6 +134,17 @@ def judge(
             lambda k: f"the model explains {vaf[k]:.0%} of the torque's variance",
         ),
     ]
+    excited = ~np.any([mask for mask, _, _ in rules[:4]], axis=0)
+    usual = np.quantile(residual[excited], 0.25) if excited.any() else np.inf
+    rules.append(
+        (
+            residual > limits.max_residual_ratio * usual,
+            POOR,
+            lambda k: (
+                f"the residual is {residual[k] / usual:.2g} times that of other windows: did the joint change here?"
+            ),
+        )
+    )
     broken = np.stack([mask for mask, _, _ in rules])
     first = np.where(broken.any(axis=0), broken.argmax(axis=0), len(rules))
     verdict = np.array([name for _, name, _ in rules] + [TRUSTED])[first]

@@ -67,12 +67,15 @@ def sliding_least_squares(
     *,
     valid: Shaped[AnyArray, "..."] | None = None,
     noise: Num[AnyArray, " L"] | Num[AnyArray, "S S"] | None = None,
+    room: int | None = None,
 ) -> SlidingFit:
     """Fit `y = W @ theta` in every window of `window` samples, `step` samples apart.
 
     **Arguments:** `W` (N, p), or (N, n, p) for n outputs that share the parameters; `y` (N,) or (N, n) [N m];
     `valid` (N,) or (N, n), False for samples that must not count; `noise` the autocovariance by lag of the noise in y
     (`signals.autocovariance` of the filter it went through), or the covariance matrix of a window's rows.
+    `room` compiles for windows of up to so many samples: lengths with the same `room` share their compiled code, which
+    takes longer to make than a short recording takes to solve.
 
     **Returns:** a `SlidingFit`. Without `noise` the standard errors are the textbook ones, RSS/(S - p): after a
     low-pass filter they are several times too small.
@@ -85,17 +88,37 @@ def sliding_least_squares(
     require_float64(W, y)
     W, y, valid = _checked(W, y, valid, window)
     starts = window_starts(len(W), window, step)
+    n_windows = len(starts)
     noise = None if noise is None else jnp.asarray(noise, W.dtype)
-    return _solve_all(W, y, valid, noise, jnp.asarray(starts), window)
+    if room is not None:
+        starts = np.pad(starts, (0, len(W) // step + 1 - n_windows), mode="edge")
+    fit = _solve_all(W, y, valid, noise, jnp.asarray(starts), window, room or window)
+    return jax.tree.map(lambda x: x[:n_windows], fit)
 
 
-@partial(jax.jit, static_argnames="window")
-def _solve_all(W: Array, y: Array, valid: Array, noise: Array | None, starts: Array, window: int) -> SlidingFit:
+@partial(jax.jit, static_argnames="room")
+def _solve_all(
+    W: Array, y: Array, valid: Array, noise: Array | None, starts: Array, window: int | Array, room: int
+) -> SlidingFit:
+    W, y, valid = _with_room((W, y, valid), room)
+
     def one(start: Array) -> SlidingFit:
-        rows, torque, counts = slice_window((W, y, valid), start, window)
-        return _as_sliding(least_squares(rows, torque, counts, noise), start + window - 1)
+        rows, torque, counts = slice_window((W, y, valid), start, room)
+        fit = least_squares(rows, torque, _first(counts, window), noise)
+        return _as_sliding(fit, start + window - 1)
 
-    return map_windows(one, starts, window * math.prod(W.shape[1:]))
+    return map_windows(one, starts, room * math.prod(W.shape[1:]))
+
+
+def _with_room(arrays: tuple[Array, ...], room: int) -> tuple[Array, ...]:
+    """Zeros (and False) behind the end, so that no window with room to spare is pushed back from it."""
+    return tuple(jnp.concatenate([array, jnp.zeros((room, *array.shape[1:]), array.dtype)]) for array in arrays)
+
+
+def _first(counts: Array, window: int | Array) -> Array:
+    """Only the first `window` samples of a window with room for more count."""
+    inside = jnp.arange(len(counts)) < window
+    return counts & inside.reshape(-1, *(1,) * (counts.ndim - 1))
 
 
 def map_windows(function: Callable[[Any], Any], starts: Any, numbers_per_window: int) -> Any:
@@ -118,30 +141,34 @@ def _as_sliding(fit: WindowFit, last: Array) -> SlidingFit:
     return SlidingFit(stderr=fit.stderr, last=last, **shared)
 
 
-@partial(jax.jit, static_argnames="window")
+@partial(jax.jit, static_argnames="room")
 def held_out_vaf(
     W: Num[AnyArray, "N *n p"],
     y: Num[AnyArray, "N *n"],
     valid: Shaped[AnyArray, "N *n"],
     theta: Num[AnyArray, "M p"],
     start: Integer[AnyArray, " M"],
-    window: int,
+    window: int | Array,
+    room: int,
 ) -> Float[Array, " M"]:
     """How well parameters predict the torque of a window that they have not seen: its VAF.
 
-    **Arguments:** `start` (M,) where the unseen window begins that each `theta` is to predict.
+    **Arguments:** `start` (M,) where the unseen window begins that each `theta` is to predict; `room` as in
+    `sliding_least_squares`, at least `window`.
 
     **Returns:** NaN where less than a whole window follows or fewer than half of its samples are valid.
     """
 
     def one(theta_and_start: tuple[Array, Array]) -> Array:
         parameters, first = theta_and_start
-        rows, torque, counts = slice_window((W, y, valid), first, window)
-        weight = counts.astype(W.dtype)
+        rows, torque, counts = slice_window(padded, first, room)
+        weight = _first(counts, window).astype(rows.dtype)
+        enough = weight.sum() >= 0.5 * window * math.prod(y.shape[1:])
         vaf = variance_accounted_for(torque, torque - rows @ parameters, weight)
-        return jnp.where((first + window <= len(W)) & (weight.mean() >= 0.5), vaf, jnp.nan)
+        return jnp.where((first + window <= len(W)) & enough, vaf, jnp.nan)
 
-    return map_windows(one, (theta, start), window * math.prod(W.shape[1:]))
+    padded = _with_room((W, y, valid), room)
+    return map_windows(one, (theta, start), room * math.prod(W.shape[1:]))
 
 
 def _checked(W: AnyArray, y: AnyArray, valid: AnyArray | None, window: int) -> tuple[Array, Array, Array]:

@@ -10,7 +10,7 @@ import pytest
 
 from jaximp.simulation.rig import (
     GRAVITY,
-    PAPER_TRAJECTORY,
+    ROBOT_TRAJECTORY,
     ElasticBands,
     Human,
     HumanLoad,
@@ -30,7 +30,7 @@ FREE = HumanLoad(stiffness=0.0, stiffness_after=0.0)
 
 
 def setpoint(time: float) -> Setpoint:
-    return Setpoint(jnp.asarray(time), *PAPER_TRAJECTORY(time))
+    return Setpoint(jnp.asarray(time), *ROBOT_TRAJECTORY(time))
 
 
 def regressor(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ def robot_parameters(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, torque: np.
     ],
 )
 def test_handle_follows_the_reference(rig: Rig, human: Human | None, limit_mrad: float) -> None:
-    motion = simulate_rig(rig, PAPER_TRAJECTORY, 10.0, human)
+    motion = simulate_rig(rig, ROBOT_TRAJECTORY, 10.0, human)
     error = np.asarray(motion.reference - motion.true_position) / 15 * 1e3
     assert np.abs(error).max() < limit_mrad
     # No transient at the start: the error is that of the later motion (before the stiffness steps), up to one count.
@@ -65,7 +65,7 @@ def test_handle_follows_the_reference(rig: Rig, human: Human | None, limit_mrad:
     "human", [None, HumanLoad(), HumanLoad(inertia=1e-5, damping=1e-4, equilibrium=0.5), ElasticBands(lever_arm=True)]
 )
 def test_equation_of_motion_holds_between_the_records(human: Human | None) -> None:
-    motion = simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, human)
+    motion = simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, human)
     q, dq, ddq = (np.asarray(x) for x in (motion.true_position, motion.true_velocity, motion.true_acceleration))
     found = robot_parameters(q, dq, ddq, np.asarray(motion.motor_torque - motion.human_torque))
     assert found == pytest.approx(TRUTH, rel=1e-8, abs=1e-12)
@@ -73,7 +73,7 @@ def test_equation_of_motion_holds_between_the_records(human: Human | None) -> No
 
 def test_positions_and_torques_are_aligned() -> None:
     """With a fine encoder, differences of the recorded positions suffice. One sample of delay must show."""
-    motion = simulate_rig(Rig(encoder_step=1e-9), PAPER_TRAJECTORY, 10.0)
+    motion = simulate_rig(Rig(encoder_step=1e-9), ROBOT_TRAJECTORY, 10.0)
     q, torque = np.asarray(motion.position), np.asarray(motion.torque)
     dq, ddq = (q[2:] - q[:-2]) / 2e-3, (q[2:] - 2 * q[1:-1] + q[:-2]) / 1e-6
     assert robot_parameters(q[1:-1], dq, ddq, torque[1:-1]) == pytest.approx(TRUTH, rel=1e-4, abs=1e-9)
@@ -83,14 +83,14 @@ def test_positions_and_torques_are_aligned() -> None:
 
 def test_human_parameters_are_in_the_human_torque() -> None:
     human = HumanLoad(inertia=1e-5, damping=1e-4, stiffness=1e-3, stiffness_after=1e-3, equilibrium=0.5)
-    motion = simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, human)
+    motion = simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, human)
     columns = [motion.true_acceleration, motion.true_velocity, motion.true_position, jnp.ones_like(motion.time)]
     theta, *_ = np.linalg.lstsq(np.stack(columns, axis=1), np.asarray(motion.human_torque))
     np.testing.assert_allclose(theta, [1e-5, 1e-4, 1e-3, -5e-4], rtol=2e-3)
 
 
 def test_stiffness_steps_at_its_time() -> None:
-    motion = simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, HumanLoad())
+    motion = simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, HumanLoad())
     stiffness = np.asarray(motion.human_torque / motion.true_position)
     np.testing.assert_allclose(stiffness[:5000], 1e-3, rtol=1e-9)
     np.testing.assert_allclose(stiffness[5001:], 2e-3, rtol=1e-9)
@@ -153,7 +153,7 @@ def test_lever_arm_of_taut_bands_is_conservative() -> None:
 
 
 def test_measurements_are_quantised_and_noisy() -> None:
-    motion = simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, key=jax.random.key(0))
+    motion = simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, key=jax.random.key(0))
     counts = np.asarray(motion.position) / (2 * np.pi / 2000)
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
     assert np.abs(motion.position - motion.true_position).max() <= np.pi / 2000 * (1 + 1e-9)
@@ -164,7 +164,7 @@ def test_measurements_are_quantised_and_noisy() -> None:
 
 def test_keys_in_a_batch_equal_a_loop() -> None:
     def torque(key: jax.Array) -> jax.Array:
-        return simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, key=key).torque
+        return simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, key=key).torque
 
     keys = jax.random.split(jax.random.key(1), 3)
     np.testing.assert_allclose(jax.vmap(torque)(keys), jnp.stack([torque(key) for key in keys]), atol=1e-12)
@@ -172,7 +172,7 @@ def test_keys_in_a_batch_equal_a_loop() -> None:
 
 def test_humans_and_references_in_a_batch_equal_a_loop() -> None:
     def motion(stiffness: jax.Array, scale: jax.Array) -> RigMotion:
-        reference = eqx.tree_at(lambda s: s.sine, PAPER_TRAJECTORY, scale * PAPER_TRAJECTORY.sine)
+        reference = eqx.tree_at(lambda s: s.sine, ROBOT_TRAJECTORY, scale * ROBOT_TRAJECTORY.sine)
         return simulate_rig(Rig(), reference, 10.0, HumanLoad(stiffness=stiffness))
 
     stiffness, scale = jnp.asarray([5e-4, 2e-3]), jnp.asarray([0.5, 1.0])
@@ -197,13 +197,13 @@ def test_scan_of_steps_is_the_simulation() -> None:
     for i in range(30):
         state, sample = one_step(rig, human, state, setpoint(i * 1e-4))
         positions.append(sample.position)
-    motion = simulate_rig(rig, PAPER_TRAJECTORY, 10.0, human)
+    motion = simulate_rig(rig, ROBOT_TRAJECTORY, 10.0, human)
     np.testing.assert_allclose(motion.true_position[:3], positions[::10], atol=1e-9)
     np.testing.assert_allclose(motion.time, np.arange(10_000) * 1e-3, atol=1e-12)
 
 
 def test_recording_holds_what_was_measured() -> None:
-    motion = simulate_rig(Rig(), PAPER_TRAJECTORY, 10.0, key=jax.random.key(2))
+    motion = simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, key=jax.random.key(2))
     recording = record(motion, "R")
     assert (recording.name, recording.joints, len(recording)) == ("R", ("revolute",), 10_000)
     assert recording.sample_rate == pytest.approx(1000.0)

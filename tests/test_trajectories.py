@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximp.simulation.rig import BANDS_TRAJECTORY, GRAVITY, PAPER_TRAJECTORY
+from jaximp.simulation.rig import GRAVITY, HUMAN_TRAJECTORY, ROBOT_TRAJECTORY
 from jaximp.trajectories import FourierSeries
 
 SERIES = FourierSeries(sine=[0.4, -1.2, 0.3], cosine=[0.7, 0.1, -0.5], offset=0.2, period=4.0)
@@ -54,7 +54,7 @@ def test_unequal_numbers_of_coefficients_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("trajectory", "order", "condition"),
-    [pytest.param(PAPER_TRAJECTORY, 5, 11.5, id="paper"), pytest.param(BANDS_TRAJECTORY, 7, 1.733, id="bands")],
+    [pytest.param(ROBOT_TRAJECTORY, 5, 11.5, id="paper"), pytest.param(HUMAN_TRAJECTORY, 7, 1.733, id="bands")],
 )
 def test_tables_excite_what_they_are_for_within_the_range_of_the_handle(
     trajectory: FourierSeries, order: int, condition: float
@@ -65,7 +65,7 @@ def test_tables_excite_what_they_are_for_within_the_range_of_the_handle(
     human = np.stack([ddq, dq, q], axis=1)
     assert trajectory.sine.shape == (order,)
     assert trajectory.period == 10.0
-    assert np.linalg.cond(robot if trajectory is PAPER_TRAJECTORY else human) <= condition
+    assert np.linalg.cond(robot if trajectory is ROBOT_TRAJECTORY else human) <= condition
     assert np.abs(q).max() <= 10.5
     # The paper drops samples with |dq| < 0.1 rad/s: only few may be lost.
     assert np.mean(np.abs(dq) < 0.1) < 0.03

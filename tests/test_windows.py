@@ -205,14 +205,15 @@ def test_gradient_through_the_estimates_is_finite_difference() -> None:
 
 
 @pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
-def test_held_out_vaf_is_a_loop(outputs: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("room", [20, 33])
+def test_held_out_vaf_is_a_loop(outputs: tuple[int, ...], room: int) -> None:
     W, y = recording(150, outputs)
     random = np.random.default_rng(6)
     valid = random.random(y.shape) < 0.7
     valid[60:100] = False
     theta = THETA + random.normal(size=(13, 3))
     start = np.r_[np.arange(0, 120, 10), 131]
-    held_out = held_out_vaf(*(jnp.asarray(x) for x in (W, y, valid, theta, start)), 20)
+    held_out = held_out_vaf(*(jnp.asarray(x) for x in (W, y, valid, theta, start)), 20, room)
     for m, first in enumerate(start):
         cut = slice(first, first + 20)
         counts = valid[cut].reshape(len(valid[cut]), -1)
@@ -226,3 +227,13 @@ def test_held_out_vaf_is_a_loop(outputs: tuple[int, ...]) -> None:
         assert float(held_out[m]) == pytest.approx(1 - scatter[0] / scatter[1], rel=1e-9)
     assert np.isfinite(held_out).sum() >= 6
     assert np.isnan(held_out[-1])
+
+
+@pytest.mark.parametrize("noise", [None, np.array([1.0, 0.5, 0.2])], ids=["white", "coloured"])
+def test_room_to_spare_changes_nothing(noise: Numbers | None) -> None:
+    random = np.random.default_rng(5)
+    W, y = random.normal(size=(200, 3)), random.normal(size=200)
+    plain = sliding_least_squares(W, y, 30, 7, noise=noise)
+    roomy = sliding_least_squares(W, y, 30, 7, noise=noise, room=80)
+    for name in ("theta", "stderr", "dof", "cond", "vaf", "last", "samples"):
+        np.testing.assert_allclose(getattr(roomy, name), getattr(plain, name), rtol=1e-9)

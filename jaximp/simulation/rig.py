@@ -26,24 +26,24 @@ from jaximp.types import Recording
 GRAVITY = 9.81
 """Gravitational acceleration [m/s^2]."""
 
-PAPER_TRAJECTORY = FourierSeries(
+ROBOT_TRAJECTORY = FourierSeries(
     sine=np.array([-7.1616, -0.00156, -2.93474, 0.00127, -0.69249]),
     cosine=np.array([1.76787, 0.00031, 2.60642, -0.00122, 1.83504]),
     offset=-0.20653,
     period=10.0,
 )
-"""Reference for the simulation of Tout et al. 2023, IV-B: order 5, 10 s, handle within 0.7 rad.
+"""A motion that excites the robot, for the simulation of Tout et al. 2023, IV-B: order 5, 10 s, within 0.7 rad.
 
 The paper does not print its coefficients. These come from `experiments/rig_trajectory.py`; the observation matrix of
 the robot, eq. (18), has the condition number 11.41 over one period."""
 
-BANDS_TRAJECTORY = FourierSeries(
+HUMAN_TRAJECTORY = FourierSeries(
     sine=np.array([5.43693, 2.31497, 1.75894, 2.01806, -0.13565, -1.10232, 0.47234]),
     cosine=np.array([2.07337, -2.71132, 0.51375, 1.03478, 0.51381, -0.45768, -0.71195]),
     offset=3.10464,
     period=10.0,
 )
-"""Reference for the rubber bands of Tout et al. 2023, V-A: order 7, 10 s, handle within 0.7 rad; made likewise.
+"""A motion that excites the human, for the bands of Tout et al. 2023, V-A: order 7, 10 s, within 0.7 rad.
 
 The observation matrix of the human, eq. (19), has the condition number 1.732 over one period, which is its lower bound.
 (The paper designs on quantised signals; the encoder's step is small against this motion and is left out.)"""
@@ -146,7 +146,7 @@ class Rig(eqx.Module):
 
     The dynamics are eq. (18) of Tout et al. 2023 with the values of its IV-A. The paper gives no gains of its PID
     controller: those below are a **choice**, as is the noise. They make the loop cross over at 15.5 Hz with a phase
-    margin of 45 degrees; on `PAPER_TRAJECTORY` the handle stays within 0.2 mrad of the reference when free and
+    margin of 45 degrees; on `ROBOT_TRAJECTORY` the handle stays within 0.2 mrad of the reference when free and
     4 mrad (0.6 mrad rms) when held by the default `HumanLoad`, most of it just after the stiffness steps. Stiffer
     gains follow better, but turn the encoder's quantisation into a torque ripple beyond the noise of the torque.
     """

@@ -8,8 +8,7 @@ import jax
 
 from jaximp.recordings import save_recording
 from jaximp.simulation.rig import (
-    BANDS_TRAJECTORY,
-    PAPER_TRAJECTORY,
+    HUMAN_TRAJECTORY,
     ElasticBands,
     Human,
     HumanLoad,
@@ -17,11 +16,14 @@ from jaximp.simulation.rig import (
     record,
     simulate_rig,
 )
+from jaximp.trajectories import FourierSeries
 from jaximp.types import Recording
 
 JOB = """\
 # The rig of Tout et al. 2023: {what}
 # Angles and torques are those of the motor; the handle turns 15 times less.
+
+reference_period = 10.0
 
 [recording]
 file = "robot_with_human.csv"
@@ -39,7 +41,7 @@ torque = {{ column = "torque_Nm", unit = "N m" }}
 [model]
 robot = {{ gear_ratio = 15, gravity = true, viscous = true, coulomb = true }}
 human = {{ gear_ratio = 15, offset = {offset} }}
-methods = [1, 3, 4]
+methods = [1, 3]
 
 [filter]
 position_cutoff = 10
@@ -55,16 +57,18 @@ parameters = ["stiffness"]
 """
 
 
-def rig_recordings(holding: str = "spring", seed: int = 0) -> tuple[Recording, Recording]:
-    """The rig alone (R) and held (RH), each 10 s (`spring`, a stiffness that doubles) or 20 s (`bands`)."""
+HOLDING = {
+    "spring": (HumanLoad(step_time=10.0), "a spring at the handle whose stiffness doubles after 10 s"),
+    "bands": (ElasticBands(), "rubber bands at the handle, half of which are removed after 10 s"),
+}
+"""What can hold the handle, for two periods of 10 s."""
+
+
+def rig_recordings(
+    human: Human, seed: int = 0, reference: FourierSeries = HUMAN_TRAJECTORY, duration: float = 20.0
+) -> tuple[Recording, Recording]:
+    """The rig alone (R) and held by a human (RH), on the same motion, `duration` [s] each."""
     rig, keys = Rig(), jax.random.split(jax.random.key(seed))
-    human: Human
-    if holding == "spring":
-        reference, human, duration = PAPER_TRAJECTORY, HumanLoad(), 10.0
-    elif holding == "bands":
-        reference, human, duration = BANDS_TRAJECTORY, ElasticBands(), 20.0
-    else:
-        raise ValueError(f"the handle can be held by 'spring' or 'bands', not '{holding}'")
     alone = simulate_rig(rig, reference, duration, key=keys[0])
     held = simulate_rig(rig, reference, duration, human, key=keys[1])
     return record(alone, "robot_alone"), record(held, "robot_with_human")
@@ -72,13 +76,8 @@ def rig_recordings(holding: str = "spring", seed: int = 0) -> tuple[Recording, R
 
 def write_rig_recordings(folder: Path, holding: str = "spring", seed: int = 0) -> None:
     """Write both recordings as CSV, and job.toml."""
-    for recording in rig_recordings(holding, seed):
+    human, what = HOLDING[holding]
+    for recording in rig_recordings(human, seed):
         save_recording(recording, folder / f"{recording.name}.csv")
-    what = {
-        "spring": "a spring at the handle whose stiffness doubles after 5 s",
-        "bands": "rubber bands at the handle, half of which are removed after 10 s",
-    }[holding]
     offset = "false" if holding == "spring" else "true"
-    # Top-level keys come first in TOML.
-    text = JOB.format(what=what, offset=offset).replace("\n[recording]", "\nreference_period = 10.0\n\n[recording]", 1)
-    (folder / "job.toml").write_text(text, encoding="utf-8")
+    (folder / "job.toml").write_text(JOB.format(what=what, offset=offset), encoding="utf-8")

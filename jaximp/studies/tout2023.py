@@ -23,6 +23,7 @@ from jaximp.least_squares import variance_accounted_for
 from jaximp.payload import fit_robot
 from jaximp.recursive import recursive_least_squares
 from jaximp.regression import design_filters, noise_of_rows
+from jaximp.simulation.rig import ROBOT_TRAJECTORY, ElasticBands, HumanLoad
 from jaximp.studies.rig_recordings import rig_recordings
 from jaximp.types import Progress, Recording
 
@@ -52,7 +53,8 @@ class Track:
 
 def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
     """Write the figures, tables.json and tables.md into an existing folder."""
-    springs, bands = rig_recordings("spring"), rig_recordings("bands")
+    springs = rig_recordings(HumanLoad(), reference=ROBOT_TRAJECTORY, duration=10.0)
+    bands = rig_recordings(ElasticBands())
     by_window = [_identify(springs, offset=False, length=length)[0] for length in WINDOWS]
     progress(0.2)
     by_method = _identify(springs, offset=False, length=2.0, methods=(1, 2, 3, 4))
@@ -102,14 +104,14 @@ def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
 
 WHY = (
     "The paper prints neither its excitation coefficients nor its noise, controller or band geometry. The motion here "
-    "is designed by gradient for the robot's condition number, the noise is 5e-4 N m, and the bands are a simulated "
-    "stand-in.",
+    "is designed by gradient (for the robot's condition number in figure 2, for the human's in figure 3), the noise is "
+    "5e-4 N m, and the bands are a simulated stand-in.",
     "Convergence here means: within 10 % of half the mean value before the bands were removed, and staying there for "
     "1 s. The paper does not say what it calls convergence.",
     "VAF here is that of the human's torque (motor torque less the robot's model), each sample reconstructed with the "
     "parameters of the window that ends there. The paper does not say which torque it means.",
     "The share of windows above the threshold (16) depends on the excitation: this motion is slow against 2 s, which "
-    "makes the offset's column nearly collinear with the stiffness's.",
+    "makes the column of the offset nearly collinear with that of the stiffness.",
     "The paper states f0 = 0.97 Hz; its own parameters give 1.15 Hz.",
 )
 """What a reader must know who compares the two columns."""
