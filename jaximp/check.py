@@ -113,7 +113,7 @@ def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
     offset = 0.5 * (before - after) / sharp if sharp > 0 else 0.0
     # A flat minimum says nothing: two samples beside it must fit visibly worse.
     determined = min(unexplained[max(best - 2, 0)], unexplained[min(best + 2, 2 * reach)]) > 1.001 * here
-    return (best - reach + offset) / recording.sample_rate, determined
+    return float((best - reach + offset) / recording.sample_rate), bool(determined)
 
 
 def _sampling(recording: Recording) -> Finding:

@@ -22,6 +22,7 @@ from jaximp.regression import (
     Filters,
     Placement,
     Rows,
+    check_window,
     column_noise,
     design_filters,
     jumped,
@@ -122,6 +123,7 @@ class Prepared:
 def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
     """Filter the recordings of a job."""
     signals.require_float64(recording.position)
+    check_window(job, recording)
     robot, human = job.models(recording.joints)
     filters = design_filters(job.filter, recording.sample_rate)
     noise = noise_of_rows(job, recording, filters)

@@ -237,16 +237,22 @@ class Placement:
     separate: bool
 
 
+def check_window(job: Job, recording: Recording) -> None:
+    """Refuse a window that is longer than the recording."""
+    duration = len(recording) / recording.sample_rate
+    if round(job.window.length * recording.sample_rate) > len(recording):
+        raise ValueError(
+            f"the window of {job.window.length:g} s is longer than the recording of {duration:.4g} s: "
+            "shorten window.length"
+        )
+
+
 def windows_in_rows(
     job: Job, recording: Recording, rows: Rows, filters: Filters, longest: float | None = None
 ) -> Placement:
     """Find the windows of a job in the rows of a recording."""
+    check_window(job, recording)
     rate = recording.sample_rate
-    if round(job.window.length * rate) > len(recording):
-        raise ValueError(
-            f"the window of {job.window.length:g} s is longer than the recording of {len(recording) / rate:.4g} s: "
-            "shorten window.length"
-        )
     if job.filter.mode == "window":
         samples = round(job.window.length * rate)
         block = len(range(0, samples, filters.decimate))

@@ -206,15 +206,12 @@ def quantisation_step(x: NDArray[np.float64]) -> float:
     The step is the smallest difference between distinct values, provided that all differences are whole multiples of
     it and values repeat often; a finely resolved signal has no such step.
     """
-    values, counts = np.unique(x[np.isfinite(x)], return_counts=True)
-    if len(values) < 3 or counts.mean() < 2:
+    values = np.unique(x[np.isfinite(x)])
+    # Sums of steps differ in their last digits: those are one value.
+    values = values[np.r_[True, np.diff(values) > 1e-9 * np.abs(values).max()]] if len(values) else values
+    if len(values) < 3 or len(x) < 2 * len(values):
         return 0.0
     gaps = np.diff(values)
-    smallest = gaps.min()
-    scale = np.abs(values).max()
-    if smallest <= 1e-12 * scale:
-        return 0.0
-    multiples = gaps / smallest
+    multiples = gaps / gaps.min()
     fits = np.abs(multiples - np.round(multiples)) < 0.05
-    step = float(np.median((gaps / np.maximum(np.round(multiples), 1))[fits])) if fits.any() else 0.0
-    return step if fits.mean() > 0.9 else 0.0
+    return float(np.median((gaps / np.round(multiples))[fits])) if fits.mean() > 0.9 else 0.0

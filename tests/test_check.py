@@ -1,0 +1,47 @@
+"""The look at the data before a run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_identify import JOB, TIME, joint
+
+from jaximp.check import LOOK, check_recording, coherent_bandwidth, estimate_delay
+from jaximp.job import parse_job
+from jaximp.recordings import recording_from_arrays
+
+
+def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:
+    job, recording = parse_job(JOB), joint()
+    findings, proposal = check_recording(job, recording)
+    verdicts = {finding.topic: finding.verdict for finding in findings}
+    assert set(verdicts.values()) == {"ok"}, findings
+    assert 6.3 < proposal.decimation_cutoff < proposal.position_cutoff < 500
+    assert proposal.window is not None
+
+
+@pytest.mark.parametrize("samples", [-4, 0, 7])
+def test_delay_is_found(samples: int) -> None:
+    recording = joint()
+    late = replace(recording, torque=np.roll(recording.torque, samples, axis=0))
+    delay, determined = estimate_delay(parse_job(JOB), late)
+    assert determined
+    assert delay == pytest.approx(samples * 1e-3, abs=0.4e-3)
+
+
+def test_bandwidth_ends_where_the_motion_ends() -> None:
+    assert 6.0 < coherent_bandwidth(joint()) < 12.0
+
+
+def test_what_is_wrong_is_seen() -> None:
+    recording = joint()
+    clipped = np.clip(recording.torque, -4.0, None)
+    coarse = np.round(recording.position / 0.01) * 0.01
+    coarse[4000:] += 0.5  # the encoder lost counts
+    broken = recording_from_arrays(TIME, coarse, clipped)
+    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), broken)[0]}
+    assert found["torque: saturation"].verdict == LOOK
+    assert "-4" in found["torque: saturation"].text
+    assert found["position: saturation"].verdict == "ok"
+    assert "step 0.01" in found["position: noise"].text
+    assert "the position jumps (3.999 s)" in found["gaps"].text

@@ -1,0 +1,167 @@
+"""The command line as a person meets it: exit status, one line for bad input, nothing half-written."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from test_identify import TIME, joint
+
+from jaximp import cli
+from jaximp.recordings import save_recording
+
+JOB = """
+[recording]
+file = "joint.csv"
+time = "time_s"
+position = { column = "position_rad", unit = "rad" }
+torque = { column = "torque_Nm", unit = "N m" }
+[model]
+human = true
+[filter]
+position_cutoff = 40
+decimation_cutoff = 20
+[window]
+length = 1
+step = 0.2
+"""
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Path:
+    save_recording(joint(), tmp_path / "joint.csv")
+    (tmp_path / "job.toml").write_text(JOB)
+    return tmp_path / "job.toml"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    """Run `jaximp ...` in this process: exit status, standard output, standard error."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        captured = capsys.readouterr()
+        return int(stopped.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_identify_writes_everything(run, job: Path) -> None:  # type: ignore[no-untyped-def]
+    out = job.parent / "out"
+    status, said, _ = run("identify", job, "--out", out)
+    assert status == 0
+    assert "report.html" in said
+    table = pq.read_table(out / "estimates.parquet")
+    expected = {"start_s", "end_s", "stiffness", "stiffness_stderr", "condition", "sigma_min", "residual_rms", "vaf"}
+    assert expected | {"verdict"} <= set(table.column_names)
+    assert table.num_rows == 36
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["parameters"]["stiffness"]["mean"] == pytest.approx(20, rel=0.05)
+    assert (out / "report.html").read_text().count("<img") >= 4
+    assert run("identify", job, "--out", out)[0] == 1
+    assert run("identify", job, "--out", out, "--force")[0] == 0
+
+
+def test_check_proposes(run, job: Path) -> None:  # type: ignore[no-untyped-def]
+    status, said, _ = run("check", job)
+    assert status == 0
+    assert "position_cutoff = " in said
+    assert "delay" in said
+
+
+def test_simulate_writes_what_identify_reads(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    assert run("simulate", "rig", "--holding", "bands", "--out", tmp_path / "rig")[0] == 0
+    names = {path.name for path in (tmp_path / "rig").iterdir()}
+    assert {"job.toml", "robot_alone.csv", "robot_with_human.csv"} <= names
+
+
+def test_demo_finds_the_step(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    assert run("demo", "--out", tmp_path / "demo")[0] == 0
+    table = pq.read_table(tmp_path / "demo" / "estimates.parquet").to_pydict()
+    end, trusted = np.array(table["end_s"]), np.array(table["verdict"]) == "trusted"
+    stiffness = np.array(table["stiffness"])
+    assert trusted.mean() > 0.7
+    np.testing.assert_allclose(stiffness[trusted & (end < 10)], 1e-3, rtol=0.05)
+    np.testing.assert_allclose(stiffness[trusted & (end > 12)], 2e-3, rtol=0.05)
+
+
+def test_usage_errors_have_status_2(run) -> None:  # type: ignore[no-untyped-def]
+    assert run("identify")[0] == 2
+    assert run("reproduce", "nobody1900", "--out", "x")[0] == 2
+    assert run("simulate", "rig", "--colour", "red")[0] == 2
+
+
+@pytest.mark.parametrize("command", ["demo", "check", "identify", "simulate", "reproduce"])
+def test_help_teaches(run, command: str) -> None:  # type: ignore[no-untyped-def]
+    status, said, _ = run(command, "--help")
+    assert status == 0
+    assert "Usage" in said
+    assert len(said) > 300
+
+
+LINES = "\n".join(f"{t:.3f},{np.sin(9 * t):.6f},{np.sin(9 * t + 1):.6f}" for t in TIME[:3000])
+HEADER = "time_s,position_rad,torque_Nm\n"
+BAD_FILES = {
+    "empty file": (b"", "empty"),
+    "header only": (HEADER.encode(), "0 samples"),
+    "text in a number column": ((HEADER + LINES.replace("0.003,", "0.003,x", 1)).encode(), "position_rad"),
+    "constant": ((HEADER + "\n".join(f"{t:.3f},0.5,1.0" for t in TIME[:3000])).encode(), "constant"),
+    "all NaN": ((HEADER + "\n".join(f"{t:.3f},nan,1.0" for t in TIME[:3000])).encode(), "position_rad"),
+    "Inf": ((HEADER + LINES + "\n3.000,inf,0.1").encode(), "row 3001"),
+    "time backwards": ((HEADER + LINES + "\n0.500,0.1,0.1").encode(), "row 3001"),
+    "few samples": ((HEADER + "\n".join(LINES.split("\n")[:200])).encode(), "shorten window.length"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files_end_in_one_line(run, job: Path, case: str) -> None:  # type: ignore[no-untyped-def]
+    content, message = BAD_FILES[case]
+    (job.parent / "joint.csv").write_bytes(content)
+    refused(run, job, message)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"position_rad"', '"positon_rad"', "did you mean 'position_rad'"),
+        ('unit = "rad"', 'unit = "parsnip"', "parsnip"),
+        ('unit = "rad"', 'unit = "kg"', "kg"),
+        ("position_cutoff = 40", "position_cutoff = 4000", "between 0 and 500 Hz"),
+        ("length = 1", "length = 0.02", "cannot determine 4 parameters"),
+        ("length = 1", "length = 60", "shorten window.length"),
+        ('time = "time_s"', 'time = "time_s"\ngear_ratio = -2', "gear_ratio"),
+        ("joint.csv", "joint.parquet", "there is no such file"),
+    ],
+)
+def test_bad_jobs_end_in_one_line(run, job: Path, old: str, new: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    job.write_text(job.read_text().replace(old, new, 1))
+    refused(run, job, message)
+
+
+def test_truncated_and_pickled_files_end_in_one_line(run, job: Path) -> None:  # type: ignore[no-untyped-def]
+    folder, text = job.parent, job.read_text()
+    save_recording(joint(), folder / "joint.parquet")
+    (folder / "joint.parquet").write_bytes((folder / "joint.parquet").read_bytes()[:2000])
+    job.write_text(text.replace("joint.csv", "joint.parquet"))
+    refused(run, job, "joint.parquet")
+    (folder / "joint.mat").write_bytes(b"MATLAB 5.0 MAT-file" + b" " * 200)
+    job.write_text(text.replace("joint.csv", "joint.mat"))
+    refused(run, job, "joint.mat")
+    np.savez(folder / "joint.npz", time_s=TIME, position_rad=np.array([{}], dtype=object), torque_Nm=TIME)
+    job.write_text(text.replace("joint.csv", "joint.npz"))
+    refused(run, job, "Python objects")
+
+
+def refused(run, job: Path, message: str) -> None:  # type: ignore[no-untyped-def]
+    before = {path.name for path in job.parent.iterdir()}
+    status, _, complained = run("identify", job, "--out", job.parent / "out")
+    assert status == 1
+    assert complained.startswith("error: ")
+    assert complained.strip().count("\n") == 0
+    assert message in complained
+    assert {path.name for path in job.parent.iterdir()} == before

@@ -1,0 +1,172 @@
+"""The job on recordings: the real ones where they are at hand, and a simulated joint everywhere."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaximp.identify import identify, identify_recording, in_windows, prepare
+from jaximp.job import parse_job
+from jaximp.recordings import recording_from_arrays
+from jaximp.types import Recording
+
+TIME = np.arange(8000) * 1e-3
+TRUTH = {"inertia": 0.1, "damping": 1.5, "stiffness": 20.0, "offset_torque": -2.0}
+JOB = """
+recording = {}
+[model]
+human = true
+[filter]
+position_cutoff = 40
+decimation_cutoff = 20
+[window]
+length = 1
+step = 0.1
+"""
+
+
+def joint(**changes: float) -> Recording:
+    """A joint that moves at three frequencies, with torque noise."""
+    truth = TRUTH | changes
+    lines = ((0.2, 1.1, 0.0), (0.1, 2.9, 0.5), (0.04, 6.3, 1.0))
+    q, dq, ddq = (
+        sum(a * (2 * np.pi * f) ** k * np.sin(2 * np.pi * f * TIME + p + k * np.pi / 2) for a, f, p in lines)
+        for k in range(3)
+    )
+    torque = truth["inertia"] * ddq + truth["damping"] * dq + truth["stiffness"] * q + truth["offset_torque"]
+    noise = np.random.default_rng(1).normal(0, 0.2, len(TIME))
+    return recording_from_arrays(TIME, np.asarray(q), torque + noise)
+
+
+def test_finds_a_simulated_joint_and_predicts_what_it_has_not_seen() -> None:
+    estimates = identify_recording(parse_job(JOB), joint())[0]
+    z = (np.asarray(estimates.fit.theta) - list(TRUTH.values())) / np.asarray(estimates.fit.stderr)
+    assert estimates.names == tuple(TRUTH)
+    assert estimates.verdicts.trusted.mean() > 0.95
+    assert np.abs(z).max() < 5
+    assert np.nanmin(estimates.held_out_vaf) > 0.99
+    later = np.isfinite(estimates.predicted[:, 0]) & np.isfinite(estimates.torque[:, 0])
+    residual = (estimates.torque - estimates.predicted)[later]
+    assert residual.std() < 0.05 * estimates.torque[later].std()
+    assert any("eq. 16" in note for note in estimates.notes)
+
+
+def test_a_gap_is_left_out_and_the_rest_unharmed() -> None:
+    recording = joint()
+    valid = recording.valid.copy()
+    valid[3000:3100] = False
+    position, torque = recording.position.copy(), recording.torque.copy()
+    position[~valid] = torque[~valid] = np.nan
+    holed = replace(recording, position=position, torque=torque, valid=valid)
+    whole, without = (identify_recording(parse_job(JOB), r)[0] for r in (recording, holed))
+    away = (whole.end < 2.8) | (whole.start > 3.3)
+    np.testing.assert_allclose(np.asarray(without.fit.theta)[away], np.asarray(whole.fit.theta)[away], rtol=1e-3)
+    near = ~away
+    assert (np.asarray(without.fit.samples)[near] < np.asarray(whole.fit.samples)[near]).all()
+
+
+@pytest.mark.parametrize("drop", [True, False], ids=["ends dropped", "ends kept"])
+def test_the_literal_mode_filters_every_window_by_itself(drop: bool) -> None:
+    text = JOB.replace("[filter]", f'[filter]\nmode = "window"\ndrop_transient = {str(drop).lower()}\n')
+    estimates = identify_recording(parse_job(text), joint())[0]
+    assert len(estimates.end) == 71
+    assert estimates.end[0] == pytest.approx(0.99, abs=0.02)
+    np.testing.assert_allclose(np.median(np.asarray(estimates.fit.theta), axis=0)[2], 20.0, rtol=0.02)
+    assert any("the inertia is biased" in note for note in estimates.notes)
+
+
+def test_other_lengths_share_the_filtered_recording() -> None:
+    job, recording = parse_job(JOB), joint()
+    prepared = prepare(job, recording)
+    half = replace(job, window=replace(job.window, length=0.5))
+    np.testing.assert_allclose(
+        in_windows(half, prepared, longest=2.0)[0].fit.theta, identify_recording(half, recording)[0].fit.theta
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("length = 1", "length = 100", "the window of 100 s is longer than the recording of 8 s"),
+        ("length = 1", "length = 0.02", "cannot determine 4 parameters"),
+        ("position_cutoff = 40", "position_cutoff = 600", "must lie between 0 and 500 Hz"),
+        ("step = 0.1", "step = 0.1\nmin_velocity = 1000", "no sample is left"),
+        ("human = true", 'human = true\n[trust]\nparameters = ["stifness"]', "did you mean 'stiffness'"),
+        ("[filter]", "[filter]\nmeasured_derivatives = true", "needs a velocity column"),
+        ("[filter]", '[filter]\nmode = "window"', "shorter than the filters' transients"),
+    ],
+)
+def test_what_cannot_be_done_is_said(old: str, new: str, message: str) -> None:
+    text = JOB.replace(old, new, 1)
+    if 'mode = "window"' in text:
+        text = text.replace("length = 1", "length = 0.2")
+    with pytest.raises(ValueError, match=message):
+        identify_recording(parse_job(text), joint())
+
+
+def test_emps_is_the_published_joint(data_folder: Path) -> None:
+    job = parse_job(
+        """
+        [recording]
+        file = "emps/DATA_EMPS.mat"
+        joint = "prismatic"
+        time = "t"
+        position = "qm"
+        torque = { column = "vir", unit = "V", gain = "35.1507 N/V" }
+        [model]
+        robot = { offset = true }
+        [filter]
+        position_cutoff = 100
+        decimation_cutoff = 20
+        [window]
+        length = 5
+        step = 0.2
+        """,
+        data_folder,
+    )
+    prepared = prepare(job, job.load())
+    windows = in_windows(job, prepared)[0]
+    whole = in_windows(replace(job, window=replace(job.window, length=24.8)), prepared)[0]
+    published = {"inertia": 95.1089, "viscous_friction": 203.5034, "coulomb_friction": 20.3935}
+    found = dict(zip(whole.names, np.asarray(whole.fit.theta)[0], strict=True))
+    assert found["inertia"] == pytest.approx(published["inertia"], rel=0.01)
+    assert found["viscous_friction"] == pytest.approx(published["viscous_friction"], rel=0.02)
+    assert found["coulomb_friction"] == pytest.approx(published["coulomb_friction"], rel=0.02)
+    mass = np.asarray(windows.fit.theta)[:, windows.names.index("inertia")]
+    np.testing.assert_allclose(mass, published["inertia"], rtol=0.02)
+
+
+ANKLE = """
+[recording]
+file = "ankle/z_df2.csv"
+time = "time_s"
+position = "position_rad"
+torque = { column = "torque_Nm", sign = -1 }
+[model]
+human = { offset = false }
+[filter]
+position_cutoff = 45
+decimation_cutoff = 45
+high_pass = 0.3
+[window]
+length = 5
+step = 0.5
+"""
+
+
+def test_the_clean_ankle_is_trusted_and_right(data_folder: Path) -> None:
+    estimates = identify(parse_job(ANKLE, data_folder))[0]
+    mean = dict(zip(estimates.names, estimates.mean_over_trusted(), strict=True))
+    assert estimates.verdicts.trusted.mean() > 0.9
+    assert mean["stiffness"] == pytest.approx(64, abs=6)
+    assert mean["damping"] == pytest.approx(0.72, abs=0.08)
+    assert mean["inertia"] == pytest.approx(0.0149, abs=0.001)
+    assert np.nanmean(estimates.held_out_vaf) > 0.9
+
+
+def test_the_ankle_with_a_reflex_is_called_a_poor_fit(data_folder: Path) -> None:
+    text = ANKLE.replace("z_df2.csv", "z_pf.npz").replace('time = "time_s"', 'sample_rate = "sample_rate_Hz"')
+    counts = identify(parse_job(text, data_folder))[0].verdicts.counts()
+    assert counts["trusted"] == 0
+    assert counts["poor fit"] > 0.9 * sum(counts.values())
