@@ -104,16 +104,17 @@ class ElasticBands(Human):
 
     From the paper: the stiffness 1.13e-3 N m/rad of all four bands, two on each side, of which two are removed (its
     Fig. 3 shows this at 10 s). **Assumed here:** one band is removed on each side, so that both stiffnesses halve; the
-    pretensions, of which the paper says only that they were slightly unequal; no damping.
+    pretensions, of which the paper says only that they were slightly unequal (these keep every band taut over the whole
+    range of the handle; smaller ones let one side go slack); no damping.
     """
 
     stiffness_plus: Scalar = array_field(default=0.565e-3)
     """Stiffness of the bundle that resists positive motion [N m/rad]."""
     stiffness_minus: Scalar = array_field(default=0.565e-3)
     """Stiffness of the bundle that resists negative motion [N m/rad]."""
-    pretension_plus: Scalar = array_field(default=9.0)
+    pretension_plus: Scalar = array_field(default=14.0)
     """Stretch of the first bundle at q = 0, as a motor angle [rad]."""
-    pretension_minus: Scalar = array_field(default=8.0)
+    pretension_minus: Scalar = array_field(default=11.0)
     """Stretch of the second bundle at q = 0, as a motor angle [rad]."""
     fraction_after: Scalar = array_field(default=0.5)
     """Share of both stiffnesses that is left from `step_time` on."""
