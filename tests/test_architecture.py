@@ -28,7 +28,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("simulation",),
     ("models",),
     ("recordings", "trajectories"),
-    ("signals",),
+    ("signals", "readers"),
     ("outputs", "types"),
 )
 """From top to bottom; a module imports from strictly lower layers, and a folder from itself."""

@@ -276,6 +276,8 @@ def mapping_of_saved(recording: Recording) -> dict[str, Any]:
     return mapping
 
 
+# The check of annotations draws random elements of long tuples, which hypothesis notices.
+@pytest.mark.filterwarnings("ignore:Do not use the `random` module")
 @pytest.mark.parametrize("extension", ["csv", "parquet"])
 @given(recording=recordings())
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -1,0 +1,182 @@
+"""Columns of a file, as they are: CSV, Parquet, MATLAB v5 and v7.3, HDF5, NPZ.
+
+pyarrow, h5py and scipy take long to import and are imported where they are needed. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximp.types import nearest
+
+
+class RecordingError(ValueError):
+    """A measurement that cannot be used: one line with the cause and the remedy."""
+
+
+def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
+    """The named columns of a file; whatever a reader's library raises becomes one line."""
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise RecordingError(f"cannot read '{path.suffix}' files; use one of: {', '.join(_READERS)}")
+    try:
+        return reader(path, list(dict.fromkeys(names)))
+    except RecordingError:
+        raise
+    except UnicodeDecodeError:
+        raise RecordingError("is not UTF-8 text; save it with that encoding") from None
+    except Exception as error:
+        cause = " ".join(str(error).split())[:100] or type(error).__name__
+        remedy = "the file is damaged, cut short or of another kind; write it anew"
+        raise RecordingError(f"cannot be read as {path.suffix} ({cause}): {remedy}") from None
+
+
+def _read_csv(path: Path, names: list[str]) -> dict[str, Any]:
+    import pyarrow
+    from pyarrow import csv as arrow
+
+    with path.open(encoding="utf-8-sig") as file:
+        header = next((line for line in file if line.strip("\r\n")), "").strip("\r\n")
+    if not header:
+        raise RecordingError("is empty; the first line must name the columns")
+    delimiter = max(",;\t", key=header.count)
+    raw = next(csv.reader([header], delimiter=delimiter))
+    spelled = {column.strip(): column for column in raw}
+    for name in names:
+        _require(name, spelled)
+        if [column.strip() for column in raw].count(name) > 1:
+            raise RecordingError(f"column {name!r} appears more than once in the header; give each column its own name")
+    wanted = {spelled[name]: pyarrow.float64() for name in names}
+    try:
+        table = arrow.read_csv(
+            path,
+            parse_options=arrow.ParseOptions(delimiter=delimiter),
+            convert_options=arrow.ConvertOptions(column_types=wanted, include_columns=list(wanted)),
+        )
+    except pyarrow.ArrowInvalid:
+        _blame_csv_row(path, delimiter, {name: raw.index(spelled[name]) for name in names}, len(raw))
+        raise
+    return {name: table[spelled[name]].to_numpy() for name in names}
+
+
+def _blame_csv_row(path: Path, delimiter: str, wanted: dict[str, int], width: int) -> None:
+    """Raise for the first data row that has a wrong number of fields, or text where a number is wanted."""
+    from pyarrow import csv as arrow
+
+    missing = {text.strip() for text in arrow.ConvertOptions().null_values}
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = filter(None, csv.reader(file, delimiter=delimiter))
+        next(rows)
+        for row, fields in enumerate(rows, start=1):
+            if len(fields) != width:
+                raise RecordingError(
+                    f"row {row} has {len(fields)} fields, the header {width}; repair or remove the row"
+                )
+            for name, i in wanted.items():
+                if fields[i].strip() not in missing and not _is_numeric(fields[i]):
+                    raise RecordingError(
+                        f"column {name!r}, row {row}: {fields[i]!r} is not a number; write numbers with a decimal "
+                        "point and leave missing ones empty"
+                    )
+
+
+def _is_numeric(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text  # Python reads 1_0 as 10, the CSV reader does not
+
+
+def _read_parquet(path: Path, names: list[str]) -> dict[str, Any]:
+    import pyarrow
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        schema = file.schema_arrow
+        for name in names:
+            _require(name, schema.names)
+            kind = schema.field(name).type
+            if not (
+                pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind) or pyarrow.types.is_decimal(kind)
+            ):
+                raise RecordingError(f"column {name!r} holds {kind}, not numbers; store it as numbers in a known unit")
+        table = file.read(columns=names)
+    return {name: table[name].cast(pyarrow.float64(), safe=False).to_numpy() for name in names}
+
+
+def _read_mat(path: Path, names: list[str]) -> dict[str, Any]:
+    """MATLAB v5 by scipy; v7.3 is HDF5 with every array transposed and structs as groups."""
+    import h5py
+
+    if h5py.is_hdf5(path):
+        paths = {name: name.replace(".", "/") for name in names}
+        found = _read_hdf5(path, list(paths.values()), matlab=True)
+        return {name: np.transpose(found[paths[name]]) for name in names}
+    from scipy.io import loadmat, whosmat
+
+    variables = [name for name, _, _ in whosmat(path)]
+    for name in names:
+        _require(name.split(".")[0], variables)
+    content = loadmat(path, variable_names=[name.split(".")[0] for name in names])
+    return {name: _mat_field(content, name) for name in names}
+
+
+def _mat_field(content: dict[str, Any], name: str) -> Any:
+    head, *fields = name.split(".")
+    value = content[head]
+    for field in fields:
+        _require(field, value.dtype.names or (), f"field {field!r} of {name!r}")
+        value = value[field][0, 0]
+    return value
+
+
+def _read_hdf5(path: Path, names: list[str], matlab: bool = False) -> dict[str, Any]:
+    import h5py
+
+    def datasets(file: Any) -> list[str]:
+        found: list[str] = []
+        file.visititems(lambda key, item: found.append(key) if isinstance(item, h5py.Dataset) else None)
+        return [key.replace("/", ".") if matlab else key for key in found if not key.startswith("#")]
+
+    with h5py.File(path, "r") as file:
+        for name in names:
+            if not isinstance(file.get(name), h5py.Dataset):
+                _require(name.replace("/", ".") if matlab else name, datasets(file))
+            if file[name].attrs.get("MATLAB_class") == b"char":
+                raise RecordingError(f"variable {name!r} holds text, not numbers; name a numeric variable")
+        return {name: file[name][()] for name in names}
+
+
+def _read_npz(path: Path, names: list[str]) -> dict[str, Any]:
+    # numpy leaves a file open that it opened itself and could not read.
+    with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        for name in names:
+            _require(name, file.files)
+        try:
+            return {name: file[name] for name in names}
+        except ValueError as error:
+            if "allow_pickle" not in str(error):
+                raise
+            raise RecordingError("holds Python objects, which are never unpickled; save plain numeric arrays") from None
+
+
+_READERS: dict[str, Callable[[Path, list[str]], dict[str, Any]]] = {
+    **dict.fromkeys((".csv", ".txt", ".tsv"), _read_csv),
+    ".parquet": _read_parquet,
+    ".mat": _read_mat,
+    **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
+    ".npz": _read_npz,
+}
+
+
+def _require(name: str, available: Iterable[str], what: str | None = None) -> None:
+    choices = list(available)
+    if name not in choices:
+        hint = nearest(name, choices) if choices else "there are none"
+        raise RecordingError(f"{what or f'column {name!r}'} is not there; {hint}")
