@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,10 +13,14 @@ from jaximp.identify import Estimates, identify_recording, jump_note
 from jaximp.job import Job
 from jaximp.models import combine
 from jaximp.regression import design_filters, regress
-from jaximp.trust import NO_DATA, WEAK
+from jaximp.trust import NEGATIVE, NO_DATA, WEAK
 from jaximp.types import Progress, Recording
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
+SLOWEST = 20.0
+"""A joint's impedance cannot be seen below this sample rate [Hz]."""
+WIDEST = 2 * np.pi
+"""No human joint turns further than this [rad]."""
 LONGEST_DELAY = 0.03
 """Delays between torque and position are sought up to this long [s]."""
 
@@ -53,36 +58,49 @@ def check_recording(
             label = channel if recording.n_joints == 1 else f"{channel} {joint + 1}"
             column = values[:, joint]
             findings += [_saturation(label, column), _resolution(label, column)]
+            if channel == "position":
+                findings += _range(label, recording.joints[joint], column)
     progress(0.1)
     bandwidth = coherent_bandwidth(recording)
     position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
     filters = replace(job.filter, position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff, decimate=None)
     findings.append(
         Finding(
-            "bandwidth", GOOD, f"position and torque belong together (coherence above 1/2) up to {bandwidth:.3g} Hz"
+            "bandwidth",
+            GOOD,
+            f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
         )
     )
     findings.append(_delay(replace(job, filter=filters), recording))
     progress(0.3)
-    window, excitation = _window(replace(job, filter=filters), recording, alone, progress)
-    why = f"1.5 times the bandwidth for the parallel filter, twice that for the position; {excitation.text}"
-    return [*findings, excitation], Proposal(position_cutoff, decimation_cutoff, window, why)
+    window, of_windows = _window(replace(job, filter=filters), recording, alone, progress)
+    why = (
+        "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that; "
+        "the window that predicts the next one best: a longer one is more precise, a shorter one follows changes sooner"
+    )
+    return [*findings, *of_windows], Proposal(position_cutoff, decimation_cutoff, window, why)
 
 
 def coherent_bandwidth(recording: Recording) -> float:
-    """Highest frequency [Hz] up to which position and torque of some joint share at least half of their variance."""
-    from scipy.signal import coherence
+    """Frequency [Hz] up to which some joint's position and torque share four fifths of their variance.
+
+    At least five times the frequency below which 95 % of the position's power lies: a motion of a few lines is coherent
+    at those alone.
+    """
+    from scipy.signal import coherence, welch
 
     q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
     rate = recording.sample_rate
     n = int(min(len(recording) // 4, max(256, 8 * rate)))
     frequency, shared = coherence(np.diff(q, axis=0), torque[1:], fs=rate, nperseg=n, axis=0)
     smooth = np.convolve(shared.max(axis=1), np.ones(5) / 5, mode="same")
-    together = smooth[1:] > 0.5
+    together = smooth[1:] > 0.8
     # Only the first stretch counts: hum far above the motion is coherent as well.
     first = int(np.argmax(together))
     length = int(np.argmin(np.r_[together[first:], False]))
-    return float(frequency[max(1, first + length)])
+    power = np.cumsum(welch(q, fs=rate, nperseg=n, axis=0)[1].sum(axis=1))
+    slow = frequency[int(np.searchsorted(power, 0.95 * power[-1]))]
+    return float(max(frequency[max(1, first + length)], 5 * slow))
 
 
 def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
@@ -118,7 +136,17 @@ def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
 
 def _sampling(recording: Recording) -> Finding:
     text = f"{len(recording)} samples at {recording.sample_rate:.6g} Hz, {len(recording) / recording.sample_rate:.4g} s"
+    if recording.sample_rate < SLOWEST:
+        return Finding("sampling", BAD, f"{text}: too slow for a joint; is the time's unit right (ms?)")
     return Finding("sampling", LOOK if recording.notes else GOOD, "; ".join([text, *recording.notes]))
+
+
+def _range(label: str, joint: str, x: NDArray[np.float64]) -> list[Finding]:
+    """A joint that turns around several times was probably written down in degrees."""
+    span = float(np.nanmax(x) - np.nanmin(x))
+    if joint != "revolute" or span < WIDEST:
+        return []
+    return [Finding(f"{label}: range", LOOK, f"{span:.3g} rad: is it the motor's angle, or should unit be 'deg'?")]
 
 
 def _gaps(recording: Recording) -> Finding:
@@ -157,7 +185,7 @@ def _resolution(label: str, x: NDArray[np.float64]) -> Finding:
 
 def _cutoffs(bandwidth: float, recording: Recording) -> tuple[float, float]:
     """Position and parallel cut-off [Hz], two digits, below a quarter and an eighth of the sample rate."""
-    decimation = min(1.5 * bandwidth, recording.sample_rate / 8)
+    decimation = min(bandwidth, recording.sample_rate / 8)
     position = min(2 * decimation, recording.sample_rate / 4)
     return float(f"{position:.2g}"), float(f"{decimation:.2g}")
 
@@ -168,45 +196,59 @@ def _delay(job: Job, recording: Recording) -> Finding:
         return Finding("delay", GOOD, "the data do not determine a delay between torque and position")
     text = f"the model fits best if torque lags position by {1e3 * delay:.2f} ms"
     if abs(delay) < 0.5 / recording.sample_rate:
-        return Finding("delay", GOOD, f"{text}, less than half a sample")
+        return Finding("delay", GOOD, f"{text}, within half a sample")
     return Finding(
         "delay",
         LOOK,
-        f"{text} ({delay * recording.sample_rate:.1f} samples): shift one column if the recorder did this",
+        f"{text} ({delay * recording.sample_rate:.1f} samples): if the recorder did this, shift the torque by that before it is read",
     )
 
 
 def _window(
     job: Job, recording: Recording, alone: Recording | None, progress: Progress
-) -> tuple[float | None, Finding]:
-    """The shortest of a few lengths in which nine windows of ten are excited."""
+) -> tuple[float | None, list[Finding]]:
+    """Of a few lengths in which nine windows of ten are excited, the one that predicts the next window best."""
     duration = len(recording) / recording.sample_rate
     tried = [length for length in (0.5, 1.0, 2.0, 5.0, 10.0) if length <= duration / 3]
-    seen = []
+    seen, good, signs = [], {}, []
     for count, length in enumerate(tried):
-        shares = _excited(job, recording, alone, length)
+        estimates = _trial(job, recording, alone, length)
         progress(0.3 + 0.7 * (count + 1) / len(tried))
-        if shares is None:
+        if estimates is None:
             continue
-        seen.append(f"{length:g} s {shares:.0%}")
-        if shares >= 0.9:
-            text = f"{shares:.0%} of the windows of {length:g} s are excited"
-            return length, Finding("excitation", GOOD, text)
-    text = "windows that are excited: " + (", ".join(seen) if seen else "none could be tried")
-    return None, Finding("excitation", BAD, f"{text}: the motion does not excite this model, or the model is too large")
+        verdict = estimates.verdicts.verdict
+        with_data = verdict != NO_DATA
+        share = float((verdict[with_data] != WEAK).mean()) if with_data.any() else 0.0
+        signs.append(np.char.find(estimates.verdicts.reason[with_data], NEGATIVE) >= 0)
+        seen.append(f"{length:g} s {share:.0%}")
+        if share >= 0.9:
+            good[length] = float(np.nanmean(estimates.held_out_vaf[with_data]))
+    return max(good, key=lambda length: good[length], default=None), [
+        _excitation(seen, good),
+        *([_sign()] if signs and np.mean(np.concatenate(signs)) > 0.5 else []),
+    ]
 
 
-def _excited(job: Job, recording: Recording, alone: Recording | None, length: float) -> float | None:
-    """Share of the windows with data whose parameters are determined; None where the length cannot be tried."""
+def _trial(job: Job, recording: Recording, alone: Recording | None, length: float) -> Estimates | None:
+    """Estimates with windows of one length; None where it cannot be tried."""
+    step = max(length / 10, len(recording) / recording.sample_rate / 200)
     trial = replace(
         job,
-        window=replace(job.window, length=length, step=max(length / 10, len(recording) / recording.sample_rate / 200)),
+        window=replace(job.window, length=length, step=step),
         model=replace(job.model, methods=job.model.methods[:1]),
     )
-    try:
-        estimates: Estimates = identify_recording(trial, recording, alone)[0]
-    except ValueError:
-        return None
-    verdict = estimates.verdicts.verdict
-    with_data = verdict != NO_DATA
-    return float((verdict[with_data] != WEAK).mean()) if with_data.any() else None
+    with suppress(ValueError):
+        return identify_recording(trial, recording, alone)[0]
+    return None
+
+
+def _excitation(seen: list[str], good: dict[float, float]) -> Finding:
+    if good:
+        held_out = ", ".join(f"{length:g} s {vaf:.0%}" for length, vaf in good.items())
+        return Finding("excitation", GOOD, f"variance explained in the next, unseen window: {held_out}")
+    text = "windows that are excited: " + (", ".join(seen) if seen else "none could be tried")
+    return Finding("excitation", BAD, f"{text}: the motion does not excite this model, or the model is too large")
+
+
+def _sign() -> Finding:
+    return Finding("torque: sign", BAD, "the inertia comes out negative: set sign = -1 for the torque")

@@ -8,13 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from jaximp.types import Progress
+
+if TYPE_CHECKING:  # what a command needs is imported when it runs: `--help` must not wait for it
+    from jaximp.identify import Estimates
+    from jaximp.job import Job
 
 app = typer.Typer(
     add_completion=False,
@@ -82,8 +86,12 @@ def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
     Writes estimates.parquet (one row per window), summary.json, report.html and the figures into the folder.
     """
     from jaximp.job import read_job
+    from jaximp.outputs import new_folder
 
-    _run_job(read_job(job_file), out, force)
+    job = read_job(job_file)
+    with new_folder(out, force) as folder:
+        _identify_into(job, folder)
+    _say_where(out)
 
 
 @app.command()
@@ -98,7 +106,9 @@ def demo(
     from jaximp.studies.rig_recordings import write_rig_recordings
 
     with new_folder(out, force) as folder:
-        write_rig_recordings(folder, "spring", seed)
+        with _progress("simulating") as progress:
+            write_rig_recordings(folder, "spring", seed)
+            progress(1.0)
         _identify_into(read_job(folder / "job.toml"), folder)
     _say_where(out)
 
@@ -139,8 +149,9 @@ def simulate(
     from jaximp.outputs import new_folder
     from jaximp.studies.rig_recordings import write_rig_recordings
 
-    with new_folder(out, force) as folder:
+    with new_folder(out, force) as folder, _progress("simulating") as progress:
         write_rig_recordings(folder, holding.value, seed)
+        progress(1.0)
     typer.echo(f"recordings and job: {out}\nnext: jaximp identify {out / 'job.toml'} --out {out.name}-results")
 
 
@@ -155,15 +166,7 @@ def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
     typer.echo(f"figures and tables: {out}")
 
 
-def _run_job(job, out: Path, force: bool) -> None:  # type: ignore[no-untyped-def]
-    from jaximp.outputs import new_folder
-
-    with new_folder(out, force) as folder:
-        _identify_into(job, folder)
-    _say_where(out)
-
-
-def _identify_into(job, folder: Path) -> None:  # type: ignore[no-untyped-def]
+def _identify_into(job: Job, folder: Path) -> None:
     from jaximp.identify import at_other_lengths, in_windows, prepare
     from jaximp.report import write_results
 
@@ -177,8 +180,17 @@ def _identify_into(job, folder: Path) -> None:  # type: ignore[no-untyped-def]
         progress(0.8)
         write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
         progress(1.0)
-    counts = {name: count for name, count in estimates[0].verdicts.counts().items() if count}
+    _say_result(estimates[0])
+
+
+def _say_result(estimates: Estimates) -> None:
+    counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
     typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    if not estimates.verdicts.trusted.any():
+        typer.echo("no window can be trusted, for example: " + next(filter(None, estimates.verdicts.reason)))
+        return
+    for name, unit, mean in zip(estimates.names, estimates.units, estimates.mean_over_trusted(), strict=True):
+        typer.echo(f"{name:>16} {mean:11.4g} {unit}  (mean over the trusted windows)")
 
 
 def _say_where(out: Path) -> None:

@@ -15,6 +15,8 @@ from jaximp.types import AnyArray, nearest
 from jaximp.windows import SlidingFit
 
 TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
+NEGATIVE = "is negative, as no mass can be"
+"""Part of the reason that a wrong sign of the torque leads to."""
 VERDICTS = (TRUSTED, WEAK, FAKE, POOR, NO_DATA)
 
 
@@ -27,6 +29,8 @@ class TrustLimits:
     max_residual_ratio: float = 4.0
     """Largest residual, as a multiple of the lower quartile over the excited windows: above it something happened that
     the model does not know, such as a parameter that changes inside the window."""
+    max_negative_inertia: float = 5.0
+    """How far below zero an inertia may come out, in standard errors; beyond, torque's sign or model is wrong."""
     max_relative_stderr: float = 0.2
     """Largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
     min_excitation_ratio: float = 5.0
@@ -86,7 +90,8 @@ def judge(
        error is too large. The condition number alone cannot tell: on a still arm, noise builds a well conditioned
        regressor.
     3. *fake change*: the condition number is above the threshold of eqs. (16), (17), where one is given.
-    4. *poor fit*: the model explains too little of the torque, or much less than in other windows.
+    4. *poor fit*: the model explains too little of the torque, or much less than in other windows, or gives a negative
+       inertia.
 
     **Arguments:** `names` (p) of the parameters; `window_samples` torque samples in a full window;
     `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
@@ -142,6 +147,17 @@ def judge(
             POOR,
             lambda k: (
                 f"the residual is {residual[k] / usual:.2g} times that of other windows: did the joint change here?"
+            ),
+        )
+    )
+    mass = np.array([name.endswith("inertia") for name in names])
+    below_zero = np.where(mass, -theta / stderr, -np.inf).max(axis=1)
+    rules.append(
+        (
+            below_zero > limits.max_negative_inertia,
+            POOR,
+            lambda k: (
+                f"the inertia {NEGATIVE}, by {below_zero[k]:.2g} standard errors: does the torque need sign = -1?"
             ),
         )
     )

@@ -54,8 +54,9 @@ class Recording:
 
     @property
     def sample_rate(self) -> float:
-        """Samples per second [Hz]."""
-        return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
+        """Samples per second [Hz], to nine digits: recordings made alike share compiled code whatever their clock's
+        rounding."""
+        return float(f"{(len(self.time) - 1) / (self.time[-1] - self.time[0]):.9g}")
 
     @property
     def n_joints(self) -> int:

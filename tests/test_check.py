@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from test_identify import JOB, TIME, joint
 
-from jaximp.check import LOOK, check_recording, coherent_bandwidth, estimate_delay
+from jaximp.check import BAD, LOOK, check_recording, coherent_bandwidth, estimate_delay
+from jaximp.identify import identify_recording
 from jaximp.job import parse_job
 from jaximp.recordings import recording_from_arrays
 
@@ -29,8 +30,29 @@ def test_delay_is_found(samples: int) -> None:
     assert delay == pytest.approx(samples * 1e-3, abs=0.4e-3)
 
 
+def test_a_wrong_sign_is_named_and_never_trusted() -> None:
+    recording = joint()
+    wrong = replace(recording, torque=-recording.torque)
+    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), wrong)[0]}
+    assert found["torque: sign"].verdict == BAD
+    verdicts = identify_recording(parse_job(JOB), wrong)[0].verdicts
+    assert not verdicts.trusted.any()
+    assert "sign = -1" in verdicts.reason[10]
+
+
+@pytest.mark.parametrize(
+    ("time", "angle", "topic"), [(1000.0, 1.0, "sampling"), (1.0, 180 / np.pi, "position: range")], ids=["ms", "deg"]
+)
+def test_a_wrong_unit_is_noticed(time: float, angle: float, topic: str) -> None:
+    recording = joint()
+    wrong = recording_from_arrays(time * TIME, angle * recording.position[:, 0], recording.torque[:, 0])
+    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), wrong)[0]}
+    assert found[topic].verdict in (LOOK, BAD)
+    assert found[topic].text.endswith("?") or found[topic].text.endswith("(ms?)")
+
+
 def test_bandwidth_ends_where_the_motion_ends() -> None:
-    assert 6.0 < coherent_bandwidth(joint()) < 12.0
+    assert 6.0 < coherent_bandwidth(joint()) < 20.0
 
 
 def test_what_is_wrong_is_seen() -> None:

@@ -147,7 +147,7 @@ def test_bands_go_slack_and_lose_half_of_their_stiffness() -> None:
 def test_lever_arm_of_taut_bands_is_conservative() -> None:
     """While both bundles are taut, their energy is k x^2 / 2 about the equilibrium, with x = 15 sin(q / 15)."""
     q = jnp.linspace(-7.0, 7.0, 9)
-    bands = ElasticBands(lever_arm=True)
+    bands = ElasticBands(pretension_plus=9.0, pretension_minus=8.0, lever_arm=True)
     slope = jax.vmap(jax.grad(lambda q: 0.5 * 1.13e-3 * (15 * jnp.sin(q / 15) + 0.5) ** 2))
     np.testing.assert_allclose(bands.torque(jnp.zeros(9), q, jnp.zeros(9)), jax.jit(slope)(q), atol=1e-12)
 
