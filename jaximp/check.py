@@ -93,7 +93,7 @@ def coherent_bandwidth(recording: Recording) -> float:
     rate = recording.sample_rate
     n = int(min(len(recording) // 4, max(256, 8 * rate)))
     frequency, shared = coherence(np.diff(q, axis=0), torque[1:], fs=rate, nperseg=n, axis=0)
-    smooth = np.convolve(shared.max(axis=1), np.ones(5) / 5, mode="same")
+    smooth = np.convolve(np.nan_to_num(shared).max(axis=1), np.ones(5) / 5, mode="same")
     together = smooth[1:] > 0.8
     # Only the first stretch counts: hum far above the motion is coherent as well.
     first = int(np.argmax(together))
@@ -200,7 +200,7 @@ def _delay(job: Job, recording: Recording) -> Finding:
     return Finding(
         "delay",
         LOOK,
-        f"{text} ({delay * recording.sample_rate:.1f} samples): if the recorder did this, shift the torque by that before it is read",
+        f"{text} ({delay * recording.sample_rate:.1f} samples): if the recorder did this, shift the torque beforehand",
     )
 
 

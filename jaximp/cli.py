@@ -89,7 +89,7 @@ def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
     from jaximp.outputs import new_folder
 
     job = read_job(job_file)
-    with new_folder(out, force) as folder:
+    with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
         _identify_into(job, folder)
     _say_where(out)
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.job import Job
 from jaximp.least_squares import WindowFit
-from jaximp.models import HumanJoint, Model, combine
+from jaximp.models import Model, combine
 from jaximp.payload import METHODS, Regression, fit_robot, separate
 from jaximp.regression import (
     Filters,
@@ -33,7 +35,7 @@ from jaximp.regression import (
 )
 from jaximp.trust import Verdicts, fake_change_threshold, judge
 from jaximp.types import Progress, Recording
-from jaximp.windows import SlidingFit, held_out_vaf, sliding_least_squares
+from jaximp.windows import SlidingFit, score, sliding_least_squares
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def in_windows(
         )
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
-        estimates = _estimates(job, prepared, human, found.fit, place, METHODS[method], found.warning)
+        estimates = _estimates(job, prepared, human, found.fit, place, method, METHODS[method], found.warning)
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(job.model.methods))
     return results
@@ -221,14 +223,19 @@ def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
     return alone
 
 
-def _estimates(job: Job, prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement, *notes: str) -> Estimates:
+def _estimates(
+    job: Job, prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement, method: int | None = None, *notes: str
+) -> Estimates:
     """Judge the windows of a fit and predict what they have not seen."""
     recording, model = prepared.recording, prepared.model
     starts, ahead = place.starts[: len(fit.last)], jnp.asarray(place.next_starts[: len(fit.last)])
-    held_out = held_out_vaf(
-        rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta, ahead, place.window, place.room or place.window
-    )
-    threshold, why_not = _threshold(job, recording, model)
+    against = partial(score, rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta)
+    held_out = against(ahead, place.window, place.room or place.window).vaf
+    if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
+        seen = against(jnp.asarray(starts), place.window, place.room or place.window)
+        quality = (seen.vaf, seen.residual_rms, seen.samples)
+        fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
+    threshold, why_not = _threshold(job, recording, model, place, method)
     verdicts = judge(
         fit,
         model.names,
@@ -278,8 +285,15 @@ def _literal_note(job: Job) -> str:
     )
 
 
-def _threshold(job: Job, recording: Recording, model: Model) -> tuple[float | None, str]:
+def _threshold(
+    job: Job, recording: Recording, model: Model, place: Placement, method: int | None
+) -> tuple[float | None, str]:
     """Threshold of eq. (16), or why it is not applied."""
+    if method in (2, 4):
+        return None, (
+            f"method {method} solves for robot and human together: the threshold for fake changes (eq. 16) of the "
+            "human alone does not fit their condition number and is not applied"
+        )
     if recording.reference is None or job.reference_period is None:
         missing = "reference position" if recording.reference is None else "reference_period"
         return None, (
@@ -294,7 +308,7 @@ def _threshold(job: Job, recording: Recording, model: Model) -> tuple[float | No
     dq, ddq = signals.central_differences(jnp.asarray(reference), rate)
     motion = tuple(x[:, 0] if recording.n_joints == 1 else x for x in (jnp.asarray(reference), dq, ddq))
     W = model.observation_matrix(*motion).reshape(-1, len(model.names))
-    return float(fake_change_threshold(W, period, round(job.window.length * rate))), ""
+    return float(fake_change_threshold(W, period, round(job.window.length * rate * place.counted / place.window))), ""
 
 
 def _parameter_scale(rows: Rows) -> NDArray[np.float64]:
@@ -328,10 +342,3 @@ def _reconstruct(
     predicted = np.einsum("k...p,kp->k...", W[shown], theta[unseen])
     predicted[unseen < 0] = np.nan
     return reconstructed.reshape(len(shown), -1), predicted.reshape(len(shown), -1), shown
-
-
-def equilibrium(estimates: Estimates, human: Model) -> NDArray[np.float64] | None:
-    """(M,) equilibrium position of every window, where the model has an offset."""
-    if not isinstance(human, HumanJoint) or not human.offset:
-        return None
-    return np.asarray(human.equilibrium(jnp.asarray(estimates.fit.theta)))

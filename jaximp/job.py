@@ -5,6 +5,7 @@ A job is TOML. `read_job` checks every key and value and names the nearest known
 
 from __future__ import annotations
 
+import math
 import tomllib
 import types
 import typing
@@ -118,6 +119,11 @@ class Job:
         """The recording of the robot alone, where the job has one."""
         return None if self.robot_recording is None else recording_from_mapping(self.robot_recording, self.folder)
 
+    def files(self) -> list[Path]:
+        """The recordings that the job reads."""
+        tables = (self.recording, self.robot_recording or {})
+        return [self.folder / str(table["file"]) for table in tables if "file" in table]
+
     def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side."""
         robot, human = self.model.robot, self.model.human
@@ -213,11 +219,34 @@ def _check_values(job: Job) -> None:
         "reference_period": job.reference_period,
     }
     for name, value in positive.items():
-        if value is not None and not value > 0:
-            raise ValueError(f"{name} is {value}: it must be above zero")
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} is {value}: it must be a number above zero")
+    if not (job.window.min_velocity >= 0 and math.isfinite(job.window.min_velocity)):
+        raise ValueError(f"window.min_velocity is {job.window.min_velocity}: it must be zero or more")
+    for name, value in vars(job.trust).items():
+        if isinstance(value, float) and not (value >= 0 and math.isfinite(value)):
+            raise ValueError(f"trust.{name} is {value}: it must be zero or more")
+    for name in ("min_vaf", "min_valid_share"):
+        if getattr(job.trust, name) > 1:
+            raise ValueError(f"trust.{name} is {getattr(job.trust, name)}: it is a share, between 0 and 1")
+    _check_gears(job)
     offsets = [part.offset for part in (job.model.human, job.model.robot) if part is not None]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
+
+
+def _check_gears(job: Job) -> None:
+    """A gear counts once: either when the recording is read, or in the models, and there for both alike."""
+    ratios = {part.gear_ratio for part in (job.model.robot, job.model.human) if part is not None}
+    if len(ratios) > 1:
+        raise ValueError(
+            f"model.robot and model.human have different gear ratios, {sorted(ratios)}: they share one motor"
+        )
+    if ratios != {1.0} and job.recording.get("gear_ratio", 1.0) != 1.0:
+        raise ValueError(
+            "gear_ratio stands both in [recording], which brings the columns to the joint, and in [model], which "
+            "expects them at the motor: keep one of them"
+        )
 
 
 def _settings(kind: type[T], table: Any, where: str) -> T:

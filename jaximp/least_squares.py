@@ -108,14 +108,15 @@ def least_squares(
 def variance_accounted_for(
     torque: Num[AnyArray, "S *n"], residual: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]
 ) -> Float[Array, ""]:
-    """1 - var(residual)/var(torque) over the samples that count, means taken output by output."""
+    """1 - var(residual)/var(torque) over the samples that count, means taken output by output; NaN without variance."""
 
     def scatter(x: AnyArray) -> Array:
         count = jnp.maximum(weight.sum(axis=0), 1)
         x = jnp.where(weight > 0, x, 0)
         return (weight * (x - x.sum(axis=0) / count) ** 2).sum()
 
-    return 1 - scatter(residual) / scatter(torque)
+    total = scatter(torque)
+    return jnp.where(total > 0, 1 - scatter(residual) / jnp.where(total > 0, total, 1), jnp.nan)
 
 
 def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:

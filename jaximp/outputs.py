@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 MARK = ".jaximp"
@@ -14,30 +14,39 @@ MARK = ".jaximp"
 
 
 @contextmanager
-def new_folder(path: str | Path, force: bool = False) -> Iterator[Path]:
+def new_folder(path: str | Path, force: bool = False, inputs: Sequence[Path] = ()) -> Iterator[Path]:
     """A folder to write into, which takes its name `path` only when everything in it is written.
 
-    **Raises:** `ValueError` if `path` exists and `force` is off, if it is something that jaximp did not make, or if it
-    cannot be written.
+    **Arguments:** `force` replaces a folder that jaximp made; `inputs` are files that it must not hold then.
+
+    **Raises:** `ValueError` if `path` exists and `force` is off, if it is something that jaximp did not make or that
+    holds an input, or if it cannot be written.
     """
     path = Path(path)
-    _check_replaceable(path, force)
+    _check_replaceable(path, force, inputs)
+    made = [parent for parent in path.absolute().parents if not parent.exists()]
+    draft = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written: {error.strerror}; choose another --out") from None
-    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        except OSError as error:
+            raise ValueError(f"{path} cannot be written: {error.strerror}; choose another --out") from None
         draft.chmod(0o777 & ~_umask())
         (draft / MARK).touch()
         yield draft
+        _check_replaceable(path, force, inputs)  # it may have appeared meanwhile
         _take_name(draft, path)
     except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
+        if draft is not None:
+            shutil.rmtree(draft, ignore_errors=True)
+        with suppress(OSError):
+            for parent in made:
+                parent.rmdir()
         raise
 
 
-def _check_replaceable(path: Path, force: bool) -> None:
+def _check_replaceable(path: Path, force: bool, inputs: Sequence[Path]) -> None:
     if not os.path.lexists(path):
         return
     if not force:
@@ -45,6 +54,11 @@ def _check_replaceable(path: Path, force: bool) -> None:
     ours = path.is_dir() and not path.is_symlink() and ((path / MARK).exists() or not any(path.iterdir()))
     if not ours:
         raise ValueError(f"{path} was not made by jaximp, so --force will not replace it: choose another --out")
+    for name in inputs:
+        if path.resolve() in name.resolve().parents:
+            raise ValueError(
+                f"{path} holds the input {name.name}, so --force will not replace it: choose another --out"
+            )
 
 
 def _take_name(draft: Path, path: Path) -> None:
@@ -53,7 +67,13 @@ def _take_name(draft: Path, path: Path) -> None:
     if path.exists():
         aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
         os.replace(path, aside / "old")
-    os.replace(draft, path)
+    try:
+        os.replace(draft, path)
+    except OSError:
+        if aside is not None:
+            os.replace(aside / "old", path)
+            aside.rmdir()
+        raise
     if aside is not None:
         shutil.rmtree(aside, ignore_errors=True)
 

@@ -163,7 +163,7 @@ def condition_over_time(estimates: Estimates) -> Figure:
     _decades(smallest, estimates.fit.sigma_min)
     _line(vaf, estimates.end, estimates.fit.vaf, color=BLUE, label="VAF in the window")
     _line(vaf, estimates.end, estimates.held_out_vaf, color=VERMILLION, linestyle="--", label="VAF in the next window")
-    lowest = np.nanpercentile(np.append(estimates.held_out_vaf, 0.0), 2)
+    lowest = np.percentile(np.append(estimates.held_out_vaf[np.isfinite(estimates.held_out_vaf)], 0.0), 2)
     vaf.set(ylabel="variance accounted\nfor [1]", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
     vaf.set_xlabel("end of the window [s]")
     for panel in (condition, smallest, vaf):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaximp.readers import RecordingError, read_columns
-from jaximp.types import Recording, nearest, type_of_joint
+from jaximp.types import JOINT_TYPES, Recording, nearest
 
 __all__ = ["RecordingError", "load_recording", "recording_from_arrays", "recording_from_mapping", "save_recording"]
 
@@ -258,8 +258,8 @@ def _joints(joint: str | Sequence[str], n: int) -> tuple[str, ...]:
     """The type of each of `n` joints."""
     joints = tuple(joint) if isinstance(joint, list | tuple) else (str(joint),) * n
     for kind in joints:
-        if kind not in type_of_joint:
-            raise RecordingError(f"joint: unknown type {kind!r}; {nearest(str(kind), list(type_of_joint))}")
+        if kind not in JOINT_TYPES:
+            raise RecordingError(f"joint: unknown type {kind!r}; {nearest(str(kind), list(JOINT_TYPES))}")
     if len(joints) != n:
         raise RecordingError(f"joint: {len(joints)} types for {n} position columns; give one type, or one per column")
     return joints

@@ -41,6 +41,11 @@ class Filters:
         return sum(signals.reach(sos) for sos in (self.position, self.parallel) if sos is not None)
 
     @property
+    def bridge(self) -> int:
+        """Samples that a gap may last for the filters to pass over it: one in 32 of those that they reach."""
+        return self.reach // 32
+
+    @property
     def ringing(self) -> int:
         """Samples beside a jump of the position until the filters' answer to it has died out."""
         return sum(signals.reach(sos, 1e-6) for sos in (self.position, self.parallel) if sos is not None)
@@ -98,8 +103,8 @@ def regress(model: Model, recording: Recording, job: Job, filters: Filters) -> R
     valid = valid & moving if recording.n_joints == 1 else valid[:, None] & moving
     if not valid.any():
         raise ValueError(
-            "no sample is left after filtering: the recording is too short for the filters or never moves faster than "
-            "window.min_velocity"
+            f"no sample is left after filtering ({np.mean(~recording.valid):.0%} were not measured): the recording is "
+            "too short for the filters, has too many gaps, or never moves faster than window.min_velocity"
         )
     return Rows(W, y, valid, recording.time[:: filters.decimate])
 
@@ -109,9 +114,13 @@ def jumped(recording: Recording) -> NDArray[np.bool_]:
     return np.any([signals.jumps(q) for q in recording.position.T], axis=0)
 
 
-def undisturbed(recording: Recording, filters: Filters) -> NDArray[np.bool_]:
-    """(N,) samples whose filtered value comes from measurements alone, and not from a gap, an end or a jump."""
-    valid = signals.widen_gaps(recording.valid, filters.reach)
+def undisturbed(recording: Recording, filters: Filters, ends: bool = True) -> NDArray[np.bool_]:
+    """(N,) samples whose filtered value comes from measurements, and not from a gap, a jump or (`ends`) an end.
+
+    A gap that is short against the filters is bridged: the straight line across it is as good as a measurement.
+    """
+    missing = signals.long_gaps(recording.valid, filters.bridge)
+    valid = signals.widen_gaps(~missing, filters.reach, ends)
     jumps = jumped(recording)
     return valid & signals.widen_gaps(~jumps, filters.ringing, ends=False) if jumps.any() else valid
 
@@ -171,8 +180,7 @@ def _regress_in_windows(
             f"({2 * filters.reach / rate:.2g} s): lengthen them, or set filter.drop_transient = false"
         )
     index = starts[:, None] + kept
-    far_from_jumps = signals.widen_gaps(~jumped(recording), filters.ringing, ends=False)
-    valid = (recording.valid & far_from_jumps)[index] & inside
+    valid = undisturbed(recording, filters, ends=False)[index] & inside
     moving = np.asarray(speed) >= job.window.min_velocity
     valid = valid & moving if recording.n_joints == 1 else valid[..., None] & moving
     W, y = (x.reshape(-1, *x.shape[2:]) for x in (W, y))
@@ -261,6 +269,11 @@ def windows_in_rows(
         counted = int(_away_from_ends(samples, filters, job.filter).sum())
         return Placement(block, block, counted, None, starts, starts + ahead * block, separate=True)
     window = round(job.window.length * rate / filters.decimate)
+    if window * recording.n_joints < rows.W.shape[-1]:
+        raise ValueError(
+            f"a window of {job.window.length:g} s keeps {window} samples of each joint after decimation by "
+            f"{filters.decimate}, which cannot determine {rows.W.shape[-1]} parameters: lengthen window.length"
+        )
     step = max(1, round(step_seconds(job) * rate / filters.decimate))
     room = None if longest is None else max(window, round(longest * rate / filters.decimate))
     starts = window_starts(len(rows.time), window, step)

@@ -46,8 +46,8 @@ REMEDIES = {
 
 CAPTIONS = {
     "parameters": "Each estimate is an average over its window, drawn at the window's end: a steady change appears "
-    "half a window late. The interval holds the truth with probability 95 % if model and noise are as assumed and nothing "
-    "changes inside the window. Shaded stretches must not be believed.",
+    "half a window late. The interval holds the truth with probability 95 % if model and noise are as assumed and "
+    "nothing changes inside the window. Shaded stretches must not be believed.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
     "each sample (fitted), and with those of a window that had not seen it (held out).",
     "condition": "A large condition number or a small singular value means that the motion does not tell the "

@@ -162,6 +162,16 @@ def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.fl
     return filled.reshape(x.shape)
 
 
+def long_gaps(valid: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """True in the gaps of more than `longest` samples, and in those at the ends."""
+    edges = np.flatnonzero(np.diff(np.r_[False, ~valid, False].astype(np.int8)))
+    out = ~valid
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first <= longest and first > 0 and last < len(valid):
+            out[first:last] = False
+    return out
+
+
 def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[np.bool_]:
     """Also invalidate `by` samples on both sides of every gap, and at both ends: where a filter saw no measurement."""
     gone = np.cumsum(np.r_[np.zeros(by + 1), ends, ~valid, ends, np.zeros(by)])

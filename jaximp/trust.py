@@ -27,8 +27,11 @@ class TrustLimits:
     min_vaf: float = 0.75
     """Share of the torque's variance that the model must explain."""
     max_residual_ratio: float = 4.0
-    """Largest residual, as a multiple of the lower quartile over the excited windows: above it something happened that
-    the model does not know, such as a parameter that changes inside the window."""
+    """Largest residual and largest unexplained share of the torque's variance, as multiples of their lower quartiles
+    over the excited windows: where both are above, something happened that the model does not know, such as a parameter
+    that changes inside the window."""
+    min_dof: float = 3.0
+    """Fewest degrees of freedom: with less a standard error is itself a matter of luck."""
     max_negative_inertia: float = 5.0
     """How far below zero an inertia may come out, in standard errors; beyond, torque's sign or model is wrong."""
     max_relative_stderr: float = 0.2
@@ -99,6 +102,7 @@ def judge(
     """
     theta, stderr, excitation = (np.asarray(x) for x in (fit.theta, fit.stderr, fit.excitation))
     samples, cond, vaf, residual = (np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf, fit.residual_rms))
+    dof = np.asarray(fit.dof)
     with np.errstate(invalid="ignore", divide="ignore"):
         error = stderr / np.maximum(np.abs(theta), parameter_scale)
         built_by_noise = np.sqrt(samples)[:, None] * column_noise
@@ -124,6 +128,11 @@ def judge(
             lambda k: f"{names[noisiest[k]]}: its column is {ratio[k]:.2g} times what position noise alone builds",
         ),
         (
+            dof < limits.min_dof,
+            WEAK,
+            lambda k: f"{dof[k]:.2g} degrees of freedom are too few to know its own errors",
+        ),
+        (
             ~(error <= limits.max_relative_stderr),
             WEAK,
             lambda k: f"{names[loosest[k]]}: its standard error is {error[k]:.0%} of its size",
@@ -139,11 +148,12 @@ def judge(
             lambda k: f"the model explains {vaf[k]:.0%} of the torque's variance",
         ),
     ]
-    excited = ~np.any([mask for mask, _, _ in rules[:4]], axis=0)
-    usual = np.quantile(residual[excited], 0.25) if excited.any() else np.inf
+    excited = ~np.any([mask for mask, _, _ in rules[:5]], axis=0)
+    usual, usual_share = (_lower_quartile(values[excited]) for values in (residual, 1 - vaf))
     rules.append(
         (
-            residual > limits.max_residual_ratio * usual,
+            # Both: a larger motion has a larger residual, a smaller one explains a smaller share, and neither is wrong.
+            (residual > limits.max_residual_ratio * usual) & (1 - vaf > limits.max_residual_ratio * usual_share),
             POOR,
             lambda k: (
                 f"the residual is {residual[k] / usual:.2g} times that of other windows: did the joint change here?"
@@ -166,6 +176,12 @@ def judge(
     verdict = np.array([name for _, name, _ in rules] + [TRUSTED])[first]
     reason = ["" if rule == len(rules) else rules[rule][2](k) for k, rule in enumerate(first)]
     return Verdicts(verdict, np.array(reason))
+
+
+def _lower_quartile(values: NDArray[np.float64]) -> float:
+    """Of the values above zero: a window without any torque has no residual to compare with."""
+    known = values[np.isfinite(values) & (values > 0)]
+    return float(np.quantile(known, 0.25)) if len(known) else np.inf
 
 
 def _judged(names: tuple[str, ...], chosen: tuple[str, ...]) -> NDArray[np.bool_]:

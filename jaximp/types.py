@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 AnyArray = Any
 """What public functions take: arrays of JAX or numpy. (Their shape and kind of number are checked all the same.)"""
 
-type_of_joint = ("revolute", "prismatic")
+JOINT_TYPES = ("revolute", "prismatic")
 
 Progress = Callable[[float], None]
 """Called with the finished share of a long computation, from 0 to 1."""

@@ -141,8 +141,19 @@ def _as_sliding(fit: WindowFit, last: Array) -> SlidingFit:
     return SlidingFit(stderr=fit.stderr, last=last, **shared)
 
 
+class Score(eqx.Module):
+    """How well parameters explain the torque of one window each, whether they have seen it or not."""
+
+    vaf: Float[Array, "*M"]
+    """Variance accounted for; NaN where less than a whole window is there or fewer than half its samples are valid."""
+    residual_rms: Float[Array, "*M"]
+    """Root of the mean squared residual [N m]."""
+    samples: Int[Array, "*M"]
+    """Torque samples that counted."""
+
+
 @partial(jax.jit, static_argnames="room")
-def held_out_vaf(
+def score(
     W: Num[AnyArray, "N *n p"],
     y: Num[AnyArray, "N *n"],
     valid: Shaped[AnyArray, "N *n"],
@@ -150,22 +161,22 @@ def held_out_vaf(
     start: Integer[AnyArray, " M"],
     window: int | Array,
     room: int,
-) -> Float[Array, " M"]:
-    """How well parameters predict the torque of a window that they have not seen: its VAF.
+) -> Score:
+    """Hold parameters against a window of torque.
 
-    **Arguments:** `start` (M,) where the unseen window begins that each `theta` is to predict; `room` as in
+    **Arguments:** `start` (M,) where the window begins that each `theta` is held against; `room` as in
     `sliding_least_squares`, at least `window`.
-
-    **Returns:** NaN where less than a whole window follows or fewer than half of its samples are valid.
     """
 
-    def one(theta_and_start: tuple[Array, Array]) -> Array:
+    def one(theta_and_start: tuple[Array, Array]) -> Score:
         parameters, first = theta_and_start
         rows, torque, counts = slice_window(padded, first, room)
         weight = _first(counts, window).astype(rows.dtype)
-        enough = weight.sum() >= 0.5 * window * math.prod(y.shape[1:])
-        vaf = variance_accounted_for(torque, torque - rows @ parameters, weight)
-        return jnp.where((first + window <= len(W)) & enough, vaf, jnp.nan)
+        residual = jnp.where(weight > 0, torque - rows @ parameters, 0)
+        n = weight.sum()
+        complete = (first + window <= len(W)) & (n >= 0.5 * window * math.prod(y.shape[1:]))
+        vaf = jnp.where(complete, variance_accounted_for(torque, residual, weight), jnp.nan)
+        return Score(vaf, jnp.sqrt((residual**2).sum() / n), n.astype(int))
 
     padded = _with_room((W, y, valid), room)
     return map_windows(one, (theta, start), room * math.prod(W.shape[1:]))

@@ -66,6 +66,28 @@ def test_a_gap_is_left_out_and_the_rest_unharmed() -> None:
     assert (np.asarray(without.fit.samples)[near] < np.asarray(whole.fit.samples)[near]).all()
 
 
+def test_single_missing_samples_are_bridged() -> None:
+    recording = joint()
+    valid = np.random.default_rng(8).random(len(TIME)) > 0.01
+    torque = np.where(valid[:, None], recording.torque, np.nan)
+    holed = replace(recording, torque=torque, valid=valid)
+    estimates = identify_recording(parse_job(JOB), holed)[0]
+    assert estimates.verdicts.trusted.mean() > 0.95
+    np.testing.assert_allclose(np.asarray(estimates.fit.theta)[:, 2], TRUTH["stiffness"], rtol=0.03)
+
+
+@pytest.mark.parametrize("mode", ["once", "window"])
+def test_a_gap_spoils_no_window_in_either_mode(mode: str) -> None:
+    recording = joint()
+    valid = (TIME < 3.0) | (TIME > 3.1)
+    torque = np.where(valid[:, None], recording.torque, np.nan)
+    text = JOB.replace("[filter]", f'[filter]\nmode = "{mode}"\n')
+    estimates = identify_recording(parse_job(text), replace(recording, torque=torque, valid=valid))[0]
+    trusted = estimates.verdicts.trusted
+    assert trusted.sum() > 30
+    np.testing.assert_allclose(np.asarray(estimates.fit.theta)[trusted, 2], TRUTH["stiffness"], rtol=0.04)
+
+
 @pytest.mark.parametrize("drop", [True, False], ids=["ends dropped", "ends kept"])
 def test_the_literal_mode_filters_every_window_by_itself(drop: bool) -> None:
     text = JOB.replace("[filter]", f'[filter]\nmode = "window"\ndrop_transient = {str(drop).lower()}\n')

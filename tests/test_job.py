@@ -44,8 +44,12 @@ def test_models_follow_the_joints() -> None:
         ("length = 2", "lenght = 2", "unknown key 'lenght': did you mean 'length'"),
         ("length = 2", "", "has no 'length'"),
         ("length = 2", 'length = "2 s"', "window.length is '2 s': it must be a number"),
-        ("length = 2", "length = 0", "window.length is 0.0: it must be above zero"),
+        ("length = 2", "length = 0", "window.length is 0.0: it must be a number above zero"),
         ("length = 2", "length = true", "must be a number"),
+        ("length = 2", "length = inf", "window.length is inf: it must be a number above zero"),
+        ("length = 2", "length = 2\nmin_velocity = nan", "min_velocity is nan: it must be zero or more"),
+        ("[window]", "[trust]\nmin_vaf = 75\n[window]", "trust.min_vaf is 75.0: it is a share"),
+        ('file = "x.csv"', 'file = "x.csv"\ngear_ratio = 15\n', "keep one of them"),
         ("human = true", "human = 3", "must be a table"),
         ("human = true", "humen = true", "did you mean 'human'"),
         ("human = true", "human = false", "is empty"),
@@ -65,6 +69,8 @@ def test_models_follow_the_joints() -> None:
 )
 def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
     job = GOOD.replace(old, new, 1)
+    if "keep one" in message:
+        job = job.replace("human = true", "human = { gear_ratio = 15 }")
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         parse_job(job).models(("revolute",))
     assert "\n" not in str(caught.value)

@@ -51,3 +51,29 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match="cannot be written"), new_folder(tmp_path / "file" / "out"):
         pass
+
+
+def test_force_never_replaces_a_folder_that_holds_an_input(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with new_folder(out) as folder:
+        (folder / "data.csv").touch()
+    with pytest.raises(ValueError, match=r"holds the input data\.csv"), new_folder(out, True, [out / "data.csv"]):
+        pass
+    assert (out / "data.csv").exists()
+
+
+def test_a_folder_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    folder = new_folder(out)
+    folder.__enter__()
+    out.mkdir()
+    (out / "mine").touch()
+    with pytest.raises(ValueError, match="exists"):
+        folder.__exit__(None, None, None)
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "mine"]
+
+
+def test_parents_of_a_failure_are_removed(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), new_folder(tmp_path / "a" / "b" / "out"):
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []

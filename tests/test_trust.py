@@ -14,7 +14,7 @@ from jaximp.identify import Estimates, identify_recording
 from jaximp.job import parse_job
 from jaximp.recordings import recording_from_arrays
 from jaximp.trust import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK, TrustLimits, fake_change_threshold, judge
-from jaximp.windows import SlidingFit
+from jaximp.windows import SlidingFit, sliding_least_squares
 
 Numbers = NDArray[np.float64]
 
@@ -278,3 +278,25 @@ def test_fake_change_threshold_is_that_of_eq_16(period: int, window: int) -> Non
     W = np.random.default_rng(0).normal(size=(period, 3)) * np.array([30.0, 3.0, 0.3])
     expected = np.linalg.cond(W) * period / window
     assert float(fake_change_threshold(W, period, window)) == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_larger_motion_with_its_own_noise_is_no_poor_fit() -> None:
+    """The residual grows with the motion, the unexplained share does not: the model is as good as before."""
+    random = np.random.default_rng(3)
+    loud = 1 + 5 / (1 + np.exp(-10 * (TIME - 3)))
+    lines = sum(a * np.sin(2 * np.pi * f * TIME + p) for a, f, p in MULTISINE)
+    q = 0.2 * loud * np.asarray(lines)
+    dq, ddq = np.gradient(q, TIME), np.gradient(np.gradient(q, TIME), TIME)
+    clean = INERTIA * ddq + DAMPING * dq + STIFFNESS * q
+    torque = clean + 0.02 * loud * np.std(clean[TIME < 3]) * random.normal(size=len(TIME))
+    job = parse_job(JOB.format(order=8, decimate=""))
+    estimates = identify_recording(job, recording_from_arrays(TIME, q, torque))[0]
+    assert estimates.verdicts.trusted.mean() > 0.95
+
+
+def test_windows_with_hardly_more_samples_than_parameters_are_not_trusted() -> None:
+    random = np.random.default_rng(4)
+    W = random.normal(size=(200, 3))
+    fit = sliding_least_squares(W, W @ [1.0, 2.0, 3.0] + 0.01 * random.normal(size=200), 5)
+    verdicts = judge(fit, ("a", "b", "c"), 5, np.ones(3), np.zeros(3))
+    assert not verdicts.trusted.any()
