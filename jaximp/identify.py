@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.job import Job
 from jaximp.least_squares import WindowFit
-from jaximp.models import Model, combine
+from jaximp.models import Joints, Model, combine
 from jaximp.payload import METHODS, Regression, fit_robot, separate
 from jaximp.regression import (
     Filters,
@@ -33,8 +33,8 @@ from jaximp.regression import (
     step_seconds,
     windows_in_rows,
 )
-from jaximp.trust import Verdicts, fake_change_threshold, judge
-from jaximp.types import Progress, Recording
+from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
+from jaximp.types import Progress, Recording, nearest
 from jaximp.windows import SlidingFit, score, sliding_least_squares
 
 
@@ -145,6 +145,8 @@ def in_windows(
 
     **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code.
     """
+    if prepared.recording.n_joints > 1:
+        return [_joint_by_joint(job, prepared, progress, longest)]
     rows, noise = prepared.rows, prepared.noise
     place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
     if prepared.pair is None:
@@ -166,6 +168,81 @@ def in_windows(
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(job.model.methods))
     return results
+
+
+def _joint_by_joint(job: Job, prepared: Prepared, progress: Progress, longest: float | None) -> Estimates:
+    """Joints side by side share no parameter and no noise: each is solved and judged by itself."""
+    assert isinstance(prepared.model, Joints)
+    for name in job.trust.parameters:
+        if name not in prepared.model.names:
+            hint = nearest(name, list(prepared.model.names))
+            raise ValueError(f"trust.parameters has an unknown parameter '{name}': {hint}")
+    parts, first = [], 0
+    for j, model in enumerate(prepared.model.models):
+        columns = slice(first, first + len(model.names))
+        tag = f"joint{j + 1}."
+        chosen = tuple(name.removeprefix(tag) for name in job.trust.parameters if name.startswith(tag))
+        alone = replace(job, trust=replace(job.trust, parameters=chosen))
+        parts.append(in_windows(alone, _one_joint(prepared, j, model, columns), longest=longest)[0])
+        first = columns.stop
+        progress((j + 1) / len(prepared.model.models))
+    return _side_by_side(prepared.model, parts)
+
+
+def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prepared:
+    """The share of one joint in a prepared recording of several."""
+    recording, rows, this = prepared.recording, prepared.rows, slice(j, j + 1)
+    return replace(
+        prepared,
+        recording=replace(
+            recording,
+            position=recording.position[:, this],
+            torque=recording.torque[:, this],
+            reference=None if recording.reference is None else recording.reference[:, this],
+            joints=recording.joints[this],
+        ),
+        model=model,
+        rows=Rows(rows.W[:, j, columns], rows.torque[:, j], rows.valid[:, j], rows.time),
+        column_noise=prepared.column_noise[columns],
+    )
+
+
+def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
+    """One table of several joints: a window is as good as its worst joint."""
+    fits = [part.fit for part in parts]
+
+    def stacked(name: str) -> Array:
+        return jnp.stack([getattr(fit, name) for fit in fits])
+
+    def beside(name: str) -> Array:
+        return jnp.concatenate([getattr(fit, name) for fit in fits], axis=1)
+
+    fit = SlidingFit(
+        theta=beside("theta"),
+        stderr=beside("stderr"),
+        excitation=beside("excitation"),
+        dof=stacked("dof").min(axis=0),
+        cond=stacked("cond").max(axis=0),
+        sigma_min=stacked("sigma_min").min(axis=0),
+        residual_rms=jnp.sqrt((stacked("residual_rms") ** 2).mean(axis=0)),
+        vaf=stacked("vaf").min(axis=0),
+        samples=stacked("samples").sum(axis=0),
+        last=fits[0].last,
+    )
+    thresholds = [part.threshold for part in parts if part.threshold is not None]
+    return replace(
+        parts[0],
+        names=model.names,
+        units=model.units,
+        fit=fit,
+        held_out_vaf=np.min([part.held_out_vaf for part in parts], axis=0),
+        verdicts=worst([part.verdicts for part in parts], [f"joint {j + 1}: " for j in range(len(parts))]),
+        threshold=max(thresholds, default=None),
+        torque=np.concatenate([part.torque for part in parts], axis=1),
+        reconstructed=np.concatenate([part.reconstructed for part in parts], axis=1),
+        predicted=np.concatenate([part.predicted for part in parts], axis=1),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
 
 
 def at_other_lengths(
@@ -239,7 +316,7 @@ def _estimates(
     verdicts = judge(
         fit,
         model.names,
-        place.counted * recording.n_joints,
+        place.counted,
         _parameter_scale(rows),
         prepared.column_noise,
         threshold,

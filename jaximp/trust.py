@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +75,16 @@ class Verdicts:
     def counts(self) -> dict[str, int]:
         """How many windows got each verdict."""
         return {verdict: int((self.verdict == verdict).sum()) for verdict in VERDICTS}
+
+
+def worst(several: Sequence[Verdicts], labels: Sequence[str]) -> Verdicts:
+    """The worst verdict of several on the same windows, its reason behind a label."""
+    severity = {verdict: rank for rank, verdict in enumerate((TRUSTED, POOR, FAKE, WEAK, NO_DATA))}
+    ranks = np.array([[severity[name] for name in one.verdict] for one in several])
+    chosen = ranks.argmax(axis=0)
+    verdict = [several[j].verdict[k] for k, j in enumerate(chosen)]
+    reason = ["" if verdict[k] == TRUSTED else labels[j] + several[j].reason[k] for k, j in enumerate(chosen)]
+    return Verdicts(np.array(verdict), np.array(reason))
 
 
 def judge(

@@ -127,6 +127,24 @@ def test_what_cannot_be_done_is_said(old: str, new: str, message: str) -> None:
         identify_recording(parse_job(text), joint())
 
 
+def test_joints_side_by_side_are_solved_and_judged_each_by_itself() -> None:
+    good = joint()
+    unrelated = np.random.default_rng(2).normal(size=good.torque.shape).cumsum(axis=0)
+    both = replace(
+        good,
+        position=np.concatenate([good.position, 2 * good.position], axis=1),
+        torque=np.concatenate([good.torque, unrelated], axis=1),
+        joints=("revolute", "revolute"),
+    )
+    alone, paired = (identify_recording(parse_job(JOB), recording)[0] for recording in (good, both))
+    assert paired.names[:2] == ("joint1.inertia", "joint1.damping")
+    np.testing.assert_allclose(np.asarray(paired.fit.theta)[:, :4], alone.fit.theta)
+    np.testing.assert_allclose(np.asarray(paired.fit.stderr)[:, :4], alone.fit.stderr)
+    assert alone.verdicts.trusted.mean() > 0.95
+    assert paired.verdicts.trusted.mean() < 0.05
+    assert all("joint 2: " in reason for reason in paired.verdicts.reason if reason)
+
+
 def test_emps_is_the_published_joint(data_folder: Path) -> None:
     job = parse_job(
         """
