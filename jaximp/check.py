@@ -17,6 +17,8 @@ from jaximp.trust import NEGATIVE, NO_DATA, WEAK
 from jaximp.types import Progress, Recording
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
+FEWEST = 100
+"""Samples that spectra can be made of."""
 SLOWEST = 20.0
 """A joint's impedance cannot be seen below this sample rate [Hz]."""
 WIDEST = 2 * np.pi
@@ -52,6 +54,8 @@ def check_recording(
     job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> tuple[list[Finding], Proposal]:
     """Check a recording for the model of a job, and propose cut-offs and a window."""
+    if len(recording) < FEWEST:
+        raise ValueError(f"the recording has {len(recording)} samples: at least {FEWEST} are needed to check it")
     findings = [_sampling(recording), _gaps(recording)]
     for channel, values in (("position", recording.position), ("torque", recording.torque)):
         for joint in range(recording.n_joints):

@@ -135,7 +135,7 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
         rows, pair = regress(model, recording, job, filters), None
     else:
         rows, pair = _prepare_pair(job, recording, alone, robot, human, filters)
-    return Prepared(recording, model, filters, rows, noise, column_noise(model, recording, filters), pair)
+    return Prepared(recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair)
 
 
 def in_windows(

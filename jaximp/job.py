@@ -230,6 +230,9 @@ def _check_values(job: Job) -> None:
         if getattr(job.trust, name) > 1:
             raise ValueError(f"trust.{name} is {getattr(job.trust, name)}: it is a share, between 0 and 1")
     _check_gears(job)
+    for name in ("position_order", "decimation_order", "high_pass_order"):
+        if not 1 <= getattr(job.filter, name) <= 12:
+            raise ValueError(f"filter.{name} is {getattr(job.filter, name)}: it must lie between 1 and 12")
     offsets = [part.offset for part in (job.model.human, job.model.robot) if part is not None]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")

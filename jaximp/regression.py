@@ -130,13 +130,13 @@ def _filtered(
     model: Model,
     filters: Filters,
     sample_rate: float,
-    q: Array | NDArray[np.float64],
-    torque: Array | NDArray[np.float64],
-    derivatives: tuple[NDArray[np.float64] | None, NDArray[np.float64] | None] = (None, None),
+    q: AnyArray,
+    torque: AnyArray,
+    derivatives: tuple[AnyArray | None, AnyArray | None] = (None, None),
 ) -> tuple[Array, Array, Array]:
     """Regressor, torque and speed of one stretch of samples: parallel filters, then every n-th sample."""
 
-    def smooth(x: Array | NDArray[np.float64]) -> Array:
+    def smooth(x: AnyArray) -> Array:
         return jnp.asarray(x) if filters.position is None else signals.filter_zero_phase(filters.position, x)
 
     q = smooth(q)
@@ -285,20 +285,34 @@ def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | N
     if job.filter.mode == "once" or filters.parallel is None:
         return None if filters.noise is None else jnp.asarray(filters.noise)
     window = round(job.window.length * recording.sample_rate)
+    if window**2 > LARGEST_BLOCKS:
+        raise ValueError(
+            f"windows of {window} samples are too long to be filtered one by one: shorten window.length, or set "
+            "filter.mode = 'once'"
+        )
     response = signals.filter_zero_phase(filters.parallel, jnp.eye(window))[:: filters.decimate]
     return response @ response.T
 
 
-def column_noise(model: Model, recording: Recording, filters: Filters) -> NDArray[np.float64]:
-    """(p,) root mean square that noise of the position leaves in each column: the pipeline, run on noise as well.
+def column_noise(model: Model, recording: Recording, job: Job, filters: Filters) -> NDArray[np.float64]:
+    """(p,) root mean square that noise of the motion leaves in each column: the pipeline, run on noise as well.
 
     The columns that jump (the sign of the velocity) are left out: the jumps say nothing of the joint's excitation.
     """
     generator = np.random.default_rng(0)
-    noise = np.stack([generator.normal(0, signals.noise_level(q), len(q)) for q in recording.position.T], axis=1)
+
+    def with_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return x + np.stack([generator.normal(0, signals.noise_level(column), len(x)) for column in x.T], axis=1)
+
     q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
+    velocity, acceleration = _measured_derivatives(job.filter, recording)
+    noisy_motion = (
+        None if velocity is None else with_noise(velocity),
+        None if acceleration is None else with_noise(acceleration),
+    )
     rate = recording.sample_rate
-    plain, noisy = (np.asarray(_filtered(model, filters, rate, x, torque)[0]) for x in (q, q + noise))
+    plain = np.asarray(_filtered(model, filters, rate, q, torque, (velocity, acceleration))[0])
+    noisy = np.asarray(_filtered(model, filters, rate, with_noise(q), torque, noisy_motion)[0])
     difference = (noisy - plain).reshape(-1, len(model.names))
     smooth = np.array(["sign" not in column for column in model.columns])
     return np.where(smooth, np.sqrt((difference**2).mean(axis=0)), 0.0)

@@ -127,6 +127,17 @@ def test_what_cannot_be_done_is_said(old: str, new: str, message: str) -> None:
         identify_recording(parse_job(text), joint())
 
 
+def test_measured_derivatives_are_used() -> None:
+    recording = joint()
+    velocity = np.gradient(recording.position, 1e-3, axis=0)
+    measured = replace(recording, velocity=velocity, position=recording.position + 0.0)
+    text = JOB.replace("[filter]", "[filter]\nmeasured_derivatives = true\n")
+    plain, fed = identify_recording(parse_job(JOB), recording)[0], identify_recording(parse_job(text), measured)[0]
+    np.testing.assert_allclose(fed.fit.theta[:, 2], plain.fit.theta[:, 2], rtol=1e-2)
+    wrong = identify_recording(parse_job(text), replace(measured, velocity=2 * velocity))[0]
+    np.testing.assert_allclose(wrong.fit.theta[:, 1], plain.fit.theta[:, 1] / 2, rtol=0.05)
+
+
 def test_joints_side_by_side_are_solved_and_judged_each_by_itself() -> None:
     good = joint()
     unrelated = np.random.default_rng(2).normal(size=good.torque.shape).cumsum(axis=0)
