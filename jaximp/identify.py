@@ -64,7 +64,8 @@ class Estimates:
     reconstructed: NDArray[np.float64]
     """(N, n) the model's torque with the parameters of the window around each sample."""
     predicted: NDArray[np.float64]
-    """(N, n) the model's torque with the parameters of the last window that had not seen the sample."""
+    """(N, n) the model's torque with parameters that have not seen the sample: those of the last window that ended
+    before the block of one window's length in which the sample lies."""
     method: int | None = None
     """Which of the four methods told the human from the robot."""
     robot: WindowFit | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -120,11 +120,25 @@ def _read_mat(path: Path, names: list[str]) -> dict[str, Any]:
         return {name: np.transpose(found[paths[name]]) for name in names}
     from scipy.io import loadmat, whosmat
 
+    _check_complete_mat(path)
     variables = [name for name, _, _ in whosmat(path)]
     for name in names:
         _require(name.split(".")[0], variables)
     content = loadmat(path, variable_names=[name.split(".")[0] for name in names])
     return {name: _mat_field(content, name) for name in names}
+
+
+def _check_complete_mat(path: Path) -> None:
+    """Follow the variables of a MATLAB v5 file by their lengths: scipy reads a file that was cut as one with fewer."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        order: Literal["little", "big"] = "little" if file.read(128)[126:128] == b"IM" else "big"
+        position = 128
+        while position < size:
+            file.seek(position + 4)
+            position += 8 + int.from_bytes(file.read(4), order)
+    if position > size:
+        raise RecordingError("the file ends in the middle of a variable: it was cut, copy it again")
 
 
 def _mat_field(content: dict[str, Any], name: str) -> Any:

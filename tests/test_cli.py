@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.io import savemat
 from test_identify import TIME, joint
 
 from jaximp import cli
@@ -149,6 +150,10 @@ def test_truncated_and_pickled_files_end_in_one_line(run, job: Path) -> None:  #
     (folder / "joint.parquet").write_bytes((folder / "joint.parquet").read_bytes()[:2000])
     job.write_text(text.replace("joint.csv", "joint.parquet"))
     refused(run, job, "joint.parquet")
+    savemat(folder / "joint.mat", {"time_s": TIME, "position_rad": TIME, "torque_Nm": TIME})
+    (folder / "joint.mat").write_bytes((folder / "joint.mat").read_bytes()[:-1000])
+    job.write_text(text.replace("joint.csv", "joint.mat"))
+    refused(run, job, "it was cut")
     (folder / "joint.mat").write_bytes(b"MATLAB 5.0 MAT-file" + b" " * 200)
     job.write_text(text.replace("joint.csv", "joint.mat"))
     refused(run, job, "joint.mat")
