@@ -26,7 +26,7 @@ test: lint
 
 # The slow studies behind the README's tables; their results stand in experiments/results.
 studies: setup
-	for study in experiments/*.py; do $(BIN)/python $$study || exit 1; done
+	for study in experiments/*.py experiments/benchmarks/*.py; do $(BIN)/python $$study || exit 1; done
 
 # Pinned versions for every supported Python, without any download address.
 lock: setup
