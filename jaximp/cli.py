@@ -7,7 +7,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -170,16 +172,18 @@ def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
 
 def _identify_into(job: Job, folder: Path) -> None:
     from jaximp.identify import at_other_lengths, in_windows, prepare
-    from jaximp.report import write_results
 
+    # Figures take long to import: that is done while the other core compiles.
+    Thread(target=import_module, args=("jaximp.report",)).start()
     with _progress("identifying") as progress:
         recording, alone = job.load(), job.load_robot_alone()
         progress(0.1)
         prepared = prepare(job, recording, alone)
         progress(0.3)
         estimates = in_windows(job, prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
-        others = at_other_lengths(job, prepared, alone)
-        progress(0.8)
+        others = at_other_lengths(job, prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
+        from jaximp.report import write_results
+
         write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
         progress(1.0)
     _say_result(estimates[0])

@@ -247,7 +247,11 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
 
 
 def at_other_lengths(
-    job: Job, prepared: Prepared, alone: Recording | None = None, factors: tuple[float, ...] = (0.5, 2.0)
+    job: Job,
+    prepared: Prepared,
+    alone: Recording | None = None,
+    factors: tuple[float, ...] = (0.5, 2.0),
+    progress: Progress = lambda share: None,
 ) -> list[Estimates]:
     """The same data with shorter and longer windows, so that the choice of a length can be seen.
 
@@ -263,7 +267,11 @@ def at_other_lengths(
             return in_windows(other, shared, longest=max(factors) * job.window.length)
         return []
 
-    return [estimates for factor in factors for estimates in identified(factor)]
+    found = []
+    for count, factor in enumerate(factors):
+        found += identified(factor)
+        progress((count + 1) / len(factors))
+    return found
 
 
 def regress_both(
@@ -306,11 +314,11 @@ def _estimates(
 ) -> Estimates:
     """Judge the windows of a fit and predict what they have not seen."""
     recording, model = prepared.recording, prepared.model
-    starts, ahead = place.starts[: len(fit.last)], jnp.asarray(place.next_starts[: len(fit.last)])
+    starts, ahead = place.starts[: len(fit.last)], place.next_starts[: len(fit.last)]
     against = partial(score, rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta)
-    held_out = against(ahead, place.window, place.room or place.window).vaf
+    held_out = against(ahead, place.window, place.step, place.room).vaf
     if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
-        seen = against(jnp.asarray(starts), place.window, place.room or place.window)
+        seen = against(starts, place.window, place.step, place.room)
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
     threshold, why_not = _threshold(job, recording, model, place, method)

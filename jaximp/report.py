@@ -402,7 +402,7 @@ def _without_nan(value: Any) -> Any:
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{plots.number(100 * share, 3)} %"
+    return "–" if share is None else f"{plots.number(100 * share, 3)}\N{NO-BREAK SPACE}%"
 
 
 @cache

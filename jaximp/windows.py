@@ -93,7 +93,12 @@ def sliding_least_squares(
     if room is not None:
         starts = np.pad(starts, (0, len(W) // step + 1 - n_windows), mode="edge")
     fit = _solve_all(W, y, valid, noise, jnp.asarray(starts), window, room or window)
-    return jax.tree.map(lambda x: x[:n_windows], fit)
+    return fit if room is None else _first_windows(fit, n_windows)
+
+
+def _first_windows(tree: Any, n_windows: int) -> Any:
+    """Without the windows that were only there to share compiled code; slicing in numpy compiles nothing."""
+    return jax.tree.map(lambda x: x[:n_windows] if isinstance(x, jax.core.Tracer) else np.asarray(x)[:n_windows], tree)
 
 
 @partial(jax.jit, static_argnames="room")
@@ -152,22 +157,31 @@ class Score(eqx.Module):
     """Torque samples that counted."""
 
 
-@partial(jax.jit, static_argnames="room")
 def score(
     W: Num[AnyArray, "N *n p"],
     y: Num[AnyArray, "N *n"],
     valid: Shaped[AnyArray, "N *n"],
     theta: Num[AnyArray, "M p"],
     start: Integer[AnyArray, " M"],
-    window: int | Array,
-    room: int,
+    window: int,
+    step: int,
+    room: int | None = None,
 ) -> Score:
     """Hold parameters against a window of torque.
 
-    **Arguments:** `start` (M,) where the window begins that each `theta` is held against; `room` as in
-    `sliding_least_squares`, at least `window`.
+    **Arguments:** `start` (M,) where the window begins that each `theta` is held against; `window`, `step` and `room`
+    as in `sliding_least_squares`.
     """
+    n_windows = len(start)
+    if room is not None:
+        spare = (0, len(W) // step + 1 - n_windows)
+        theta, start = np.pad(theta, (spare, (0, 0)), mode="edge"), np.pad(start, spare, mode="edge")
+    scored = _score_all(W, y, valid, jnp.asarray(theta), jnp.asarray(start), window, room or window)
+    return scored if room is None else _first_windows(scored, n_windows)
 
+
+@partial(jax.jit, static_argnames="room")
+def _score_all(W: Array, y: Array, valid: Array, theta: Array, start: Array, window: int | Array, room: int) -> Score:
     def one(theta_and_start: tuple[Array, Array]) -> Score:
         parameters, first = theta_and_start
         rows, torque, counts = slice_window(padded, first, room)
