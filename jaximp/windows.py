@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Num, Shaped
 from numpy.typing import NDArray
 
+from jaximp.chunks import Estimated, Piece, make_plan, solve_all, solve_pieces, solve_traced
 from jaximp.least_squares import WindowFit, check_finite, least_squares, variance_accounted_for
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray
@@ -22,28 +24,32 @@ BATCH_NUMBERS = 4_000_000
 """How many numbers of W are gathered at a time (32 MB): windows overlap, so that all together would not fit."""
 
 
+FROM_CHUNKS = 50_000_000
+"""So many numbers in all windows together, and sums that windows share are worth the time they take to compile."""
+
+
 class SlidingFit(eqx.Module):
     """One estimate per window; a window without a unique solution is NaN throughout, `last` and `samples` apart."""
 
-    theta: Float[Array, "*M p"]
+    theta: Float[AnyArray, "*M p"]
     """Parameters, in the model's units."""
-    stderr: Float[Array, "*M p"]
+    stderr: Float[AnyArray, "*M p"]
     """Their standard errors."""
-    dof: Float[Array, "*M"]
+    dof: Float[AnyArray, "*M"]
     """Degrees of freedom of the standard errors (see `least_squares.confidence_interval`)."""
-    cond: Float[Array, "*M"]
+    cond: Float[AnyArray, "*M"]
     """Condition number of the window's W."""
-    sigma_min: Float[Array, "*M"]
+    sigma_min: Float[AnyArray, "*M"]
     """Smallest singular value of the window's W."""
-    excitation: Float[Array, "*M p"]
+    excitation: Float[AnyArray, "*M p"]
     """Norm of each column's part that the other columns cannot imitate."""
-    residual_rms: Float[Array, "*M"]
+    residual_rms: Float[AnyArray, "*M"]
     """Root of the mean squared residual [N m]."""
-    vaf: Float[Array, "*M"]
+    vaf: Float[AnyArray, "*M"]
     """Variance accounted for, 1 - var(residual)/var(torque)."""
-    samples: Int[Array, "*M"]
+    samples: Int[AnyArray, "*M"]
     """Torque samples that counted."""
-    last: Int[Array, "*M"]
+    last: Int[AnyArray, "*M"]
     """Index of each window's last sample."""
 
 
@@ -89,11 +95,70 @@ def sliding_least_squares(
     W, y, valid = _checked(W, y, valid, window)
     starts = window_starts(len(W), window, step)
     n_windows = len(starts)
+    if noise is None and n_windows * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
+        found = _in_chunks(W, y, valid, window, step, statistics=True)
+        return SlidingFit(**found._asdict(), last=starts + window - 1)
     noise = None if noise is None else jnp.asarray(noise, W.dtype)
     if room is not None:
         starts = np.pad(starts, (0, len(W) // step + 1 - n_windows), mode="edge")
     fit = _solve_all(W, y, valid, noise, jnp.asarray(starts), window, room or window)
     return fit if room is None else _first_windows(fit, n_windows)
+
+
+def sliding_theta(
+    W: Num[AnyArray, "..."],
+    y: Num[AnyArray, "..."],
+    window: int,
+    step: int = 1,
+    *,
+    valid: Shaped[AnyArray, "..."] | None = None,
+) -> Float[AnyArray, "M p"]:
+    """The estimates of `sliding_least_squares` alone, in a third of its time."""
+    require_float64(W, y)
+    W, y, valid = _checked(W, y, valid, window)
+    if len(window_starts(len(W), window, step)) * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
+        return _in_chunks(W, y, valid, window, step, statistics=False).theta
+    return sliding_least_squares(W, y, window, step, valid=valid).theta
+
+
+def sliding_pieces(pieces: Iterable[tuple[AnyArray, ...]], window: int, step: int = 1) -> Iterator[SlidingFit]:
+    """`sliding_least_squares` of a recording that does not fit into memory, part after part.
+
+    **Arguments:** `pieces` (W, y) or (W, y, valid) of consecutive samples, as many or few at a time as there are, read
+    when they are needed.
+
+    **Returns:** an iterator over the estimates of consecutive windows: to the last bit those of the whole recording,
+    where that has some ten thousand windows. `last` counts from the recording's beginning.
+
+    **Raises:** `ValueError` as `sliding_least_squares`, when it comes to the piece in question.
+    """
+    window_starts(window, window, step)
+    checked = (_checked(W, y, valid[0] if valid else None, window) for W, y, *valid in pieces)
+    beginning = next(checked, None)
+    if beginning is None:
+        raise ValueError("there are no samples: give at least one piece")
+    n_outputs, done = math.prod(beginning[1].shape[1:]), 0
+    plan = make_plan(window * n_outputs, step * n_outputs, n_outputs, statistics=True)
+    flat = (_as_piece(*piece) for piece in chain([beginning], checked))
+    for found in solve_pieces(flat, plan, window * n_outputs):
+        last = (done + np.arange(len(found.theta))) * step + window - 1
+        yield SlidingFit(**found._asdict(), last=last)
+        done += len(last)
+    if not done:
+        raise ValueError(f"the window has {window} samples, but there are fewer: shorten the window")
+
+
+def _in_chunks(W: Array, y: Array, valid: Array, window: int, step: int, statistics: bool) -> Estimated:
+    """Many windows, from sums that they share."""
+    n, n_windows = math.prod(y.shape[1:]), (len(W) - window) // step + 1
+    plan = make_plan(window * n, step * n, n, statistics, n_windows)
+    if any(isinstance(x, jax.core.Tracer) for x in (W, y, valid)) or jax.default_backend() != "cpu":
+        return solve_traced((W.reshape(-1, W.shape[-1]), y.ravel(), valid.ravel()), plan, window * n)
+    return solve_all(_as_piece(W, y, valid), plan, window * n)
+
+
+def _as_piece(W: Array, y: Array, valid: Array) -> Piece:
+    return Piece(np.asarray(W).reshape(-1, W.shape[-1]), np.asarray(y).ravel(), np.asarray(valid).ravel())
 
 
 def _first_windows(tree: Any, n_windows: int) -> Any:

@@ -1,0 +1,268 @@
+"""Who works on which rows: a recording goes through `engine` in chunks, several at a time, however long it is.
+
+A chunk is the rows of some thousand windows. Chunks lie on a grid that begins with the recording, so that one that is
+read piece by piece gives the same numbers, to the last bit, as one that lies in memory.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from jaximp.engine import BLOCK, COMPILER_OPTIONS, ChunkFit, Plan, Statistics, solve_chunk
+from jaximp.least_squares import WindowFit, least_squares
+
+LANES = {True: 500, False: 1000}
+"""Blocks in a chunk, with and without statistics; no power of two, which would crowd the cache."""
+REPAIR_NUMBERS = 1_000_000
+"""How many numbers of doubtful windows are decomposed at a time."""
+
+Numbers = NDArray[Any]
+
+
+class Piece(NamedTuple):
+    """Some rows of a recording; the rows of several outputs in turn."""
+
+    W: Numbers
+    y: Numbers
+    valid: NDArray[np.bool_]
+
+    def part(self, start: int, stop: int) -> Piece:
+        """Rows from start to stop."""
+        return Piece(self.W[start:stop], self.y[start:stop], self.valid[start:stop])
+
+
+class Estimated(NamedTuple):
+    """Numbers of consecutive windows, NaN where there is no unique solution; without statistics theta alone."""
+
+    theta: Any
+    stderr: Any = None
+    dof: Any = None
+    cond: Any = None
+    sigma_min: Any = None
+    excitation: Any = None
+    residual_rms: Any = None
+    vaf: Any = None
+    samples: Any = None
+
+
+def make_plan(window: int, step: int, outputs: int, statistics: bool, n_windows: int | None = None) -> Plan:
+    """Sizes of a chunk for windows of so many rows, so many rows apart."""
+    per_block = max(1, min(BLOCK // step, window // step))
+    block = step * per_block
+    room = 1 << (-(-window // block) - 1).bit_length()
+    lanes = max(LANES[statistics], room)
+    if n_windows is not None:  # a short recording needs no long chunk, but few lengths share compiled code
+        wanted = -(-n_windows // per_block)
+        lanes = min(lanes, next((size for size in (30, 120, 480) if size >= wanted), lanes))
+    return Plan(step, per_block, lanes, room, outputs, statistics)
+
+
+def solve_all(recording: Piece, plan: Plan, window: int) -> Estimated:
+    """Every window of a recording in memory."""
+    n_windows = (len(recording.y) - window) // plan.step + 1
+    found: Estimated | None = None
+    with ThreadPoolExecutor(_cores()) as pool:
+        starts = range(0, n_windows, plan.windows)
+        for first, part in zip(starts, pool.map(partial(_solve_at, recording, plan, window), starts), strict=True):
+            if found is None:
+                found = jax.tree.map(lambda x: np.empty((n_windows, *x.shape[1:]), x.dtype), part)
+            for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
+                whole[first : first + plan.windows] = some
+    assert found is not None
+    return found
+
+
+def solve_pieces(pieces: Iterable[Piece], plan: Plan, window: int) -> Iterator[Estimated]:
+    """Every window of a recording that comes piece by piece; as many pieces are held as a few chunks need."""
+    waiting: deque[Future[Estimated]] = deque()
+    with ThreadPoolExecutor(_cores()) as pool:
+        for rows in _chunks_of(pieces, plan, window):
+            waiting.append(pool.submit(_solve_rows, plan, window, rows))
+            if len(waiting) > 2 * _cores():
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def solve_traced(recording: Any, plan: Plan, window: int) -> Estimated:
+    """Every window inside of `jit`, `vmap` or `grad`, or on an accelerator, all chunks at a time."""
+    W, y, valid = recording
+    n_windows = (len(y) - window) // plan.step + 1
+    n_chunks = -(-n_windows // plan.windows)
+    columns = jnp.where(valid, jnp.concatenate([W.T, y[None]]), 0)
+    behind = n_chunks * plan.advance + plan.rows - plan.advance - len(y)
+    columns, valid = jnp.pad(columns, ((0, 0), (0, max(behind, 0)))), jnp.pad(valid, (0, max(behind, 0)))
+
+    def solve(start: Array) -> ChunkFit:
+        rows = lax.dynamic_slice_in_dim(columns, start, plan.rows, axis=1)
+        return solve_chunk(plan, rows, lax.dynamic_slice_in_dim(valid, start, plan.rows), window)
+
+    starts = jnp.arange(n_chunks) * plan.advance
+    batch = 1 if jax.default_backend() == "cpu" else n_chunks
+    fit = lax.map(solve, starts, batch_size=batch)
+    fit = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n_windows], fit)
+    return _finished(_repaired_traced(fit, plan, window, columns, valid), W.shape[1])
+
+
+def _repaired_traced(fit: ChunkFit, plan: Plan, window: int, columns: Array, valid: Array) -> ChunkFit:
+    """As `_repaired`. Values are those of the QR decomposition, derivatives those of the chunk's triangle."""
+    n = plan.outputs
+    fixed, columns = lax.stop_gradient((fit, columns))
+    which = jnp.nonzero(fixed.doubtful, size=len(fixed.doubtful), fill_value=0)[0]
+    count = fixed.doubtful.sum()
+
+    def decompose(state: tuple[Array, ChunkFit]) -> tuple[Array, ChunkFit]:
+        done, found = state
+        k = which[done]
+        rows = lax.dynamic_slice_in_dim(columns, k * plan.step, window, axis=1).T.reshape(-1, n, len(columns))
+        counts = lax.dynamic_slice_in_dim(valid, k * plan.step, window).reshape(-1, n)
+        exact = _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts), plan.statistics)
+        return done + 1, jax.tree.map(lambda all_, one: all_.at[k].set(one), found, exact)
+
+    exact = lax.while_loop(lambda state: state[0] < count, decompose, (jnp.zeros((), int), fixed))[1]
+    return jax.tree.map(
+        lambda x, old, new: x if x.dtype == bool else jnp.where(new == old, x, x - old + new), fit, fixed, exact
+    )._replace(solvable=exact.solvable)
+
+
+def _as_chunk_fit(exact: WindowFit, statistics: bool) -> ChunkFit:
+    """One QR decomposition in the form of a chunk's results."""
+    solvable = jnp.isfinite(exact.theta).all()
+    if not statistics:
+        return ChunkFit(exact.theta, solvable, jnp.array(True))
+    rss = exact.residual_rms**2 * exact.samples
+    samples = exact.samples.astype(rss.dtype)
+    high = exact.cond * exact.sigma_min
+    return ChunkFit(
+        exact.theta,
+        solvable,
+        jnp.array(True),
+        Statistics(1 / exact.excitation, high, exact.sigma_min, rss, exact.vaf, samples),
+    )
+
+
+def _chunks_of(pieces: Iterable[Piece], plan: Plan, window: int) -> Iterator[list[Piece]]:
+    """Rows of one chunk after another, as parts of the pieces that they come from; the last ones may be fewer."""
+    held: list[Piece] = []
+    for piece in pieces:
+        held.append(piece)
+        while sum(len(part.y) for part in held) >= plan.rows:
+            yield _cut(held, 0, plan.rows)
+            held = _cut(held, plan.advance, None)
+    while sum(len(part.y) for part in held) >= window:
+        yield _cut(held, 0, plan.rows)
+        held = _cut(held, plan.advance, None)
+
+
+def _cut(pieces: list[Piece], start: int, stop: int | None) -> list[Piece]:
+    parts, first = [], 0
+    for piece in pieces:
+        end = len(piece.y) if stop is None else min(len(piece.y), stop - first)
+        if end > max(start - first, 0):
+            parts.append(piece.part(max(start - first, 0), end))
+        first += len(piece.y)
+    return parts
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _solve_at(recording: Piece, plan: Plan, window: int, first_window: int) -> Estimated:
+    start = first_window * plan.step
+    return _solve_rows(plan, window, [recording.part(start, start + plan.rows)])
+
+
+def _solve_rows(plan: Plan, window: int, parts: list[Piece]) -> Estimated:
+    """The windows of one chunk."""
+    p = parts[0].W.shape[1]
+    columns = np.zeros((p + 1, plan.rows), np.result_type(*(part.W for part in parts)))
+    valid, at = np.zeros(plan.rows, bool), 0
+    for part in parts:
+        rows = slice(at, at + len(part.y))
+        columns[:p, rows], columns[p, rows], valid[rows] = part.W.T, part.y, part.valid
+        at = rows.stop
+    if not valid[:at].all():
+        columns[:, ~valid] = 0  # whatever a masked sample holds
+    n_windows = min(plan.windows, (at - window) // plan.step + 1)
+    fit = jax.tree.map(lambda x: np.asarray(x)[:n_windows], _compiled(plan)(columns, valid, window))
+    return _finished(_repaired(fit, plan, window, columns, valid), p)
+
+
+@cache
+def _compiled(plan: Plan) -> Any:
+    return jax.jit(partial(solve_chunk, plan), compiler_options=COMPILER_OPTIONS)
+
+
+def _repaired(fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: NDArray[np.bool_]) -> ChunkFit:
+    """The doubtful windows by a QR decomposition each."""
+    doubtful = np.flatnonzero(fit.doubtful)
+    if not len(doubtful):
+        return fit
+    fit = jax.tree.map(np.array, fit)
+    at_once = max(1, REPAIR_NUMBERS // (window * len(columns)))
+    for first in range(0, len(doubtful), at_once):
+        some = doubtful[first : first + at_once]
+        rows = (some * plan.step)[:, None] + np.arange(window)
+        windows, counts = columns[:, rows], valid[rows]  # (p + 1, m, window)
+        # A column that is zero throughout decides at once, and a still arm leaves many such windows.
+        moved = (windows[:-1] != 0).any(axis=2).all(axis=0)
+        fit.solvable[some] = moved
+        if moved.any():
+            _decompose(fit, plan, some[moved], windows[:, moved], counts[moved])
+    return fit
+
+
+def _decompose(fit: ChunkFit, plan: Plan, which: NDArray[np.int64], windows: Numbers, valid: Numbers) -> None:
+    """Put the QR decomposition of these windows (p + 1, m, rows) in the place of what the chunk's triangle gave."""
+    by_sample = np.moveaxis(windows, 0, -1).reshape(len(which), -1, plan.outputs, len(windows))
+    exact = _decompositions(by_sample, valid.reshape(by_sample.shape[:-1]), fit.statistics is not None)
+    for whole, some in zip(jax.tree.leaves(fit), jax.tree.leaves(exact), strict=True):
+        whole[which] = some
+
+
+@partial(jax.jit, static_argnames="statistics")
+def _decompositions(columns: Array, valid: Array, statistics: bool) -> ChunkFit:
+    def one(window: tuple[Array, Array]) -> ChunkFit:
+        rows, counts = window
+        return _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts), statistics)
+
+    return lax.map(one, (columns, valid), batch_size=8)
+
+
+def _finished(fit: ChunkFit, p: int) -> Estimated:
+    """Estimates as the user sees them; works on arrays of numpy and of jax alike."""
+    xp: Any = np if isinstance(fit.theta, np.ndarray) else jnp
+
+    def or_nan(x: Any) -> Any:
+        return xp.where(fit.solvable.reshape(-1, *(1,) * (x.ndim - 1)), x, xp.nan)
+
+    if fit.statistics is None:
+        return Estimated(or_nan(fit.theta))
+    with np.errstate(all="ignore"):  # where there is no solution
+        norm, high, low, rss, vaf, n = fit.statistics
+        dof = n - p
+        noise = xp.sqrt(rss / xp.where(dof > 0, dof, xp.nan))
+        return Estimated(
+            theta=or_nan(fit.theta),
+            stderr=or_nan(norm * noise[:, None]),
+            dof=or_nan(dof),
+            cond=or_nan(high / low),
+            sigma_min=or_nan(low),
+            excitation=or_nan(1 / norm),
+            residual_rms=or_nan(xp.sqrt(rss / n)),
+            vaf=or_nan(vaf),
+            samples=n.astype(int),
+        )
