@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from jaximp import windows
-from jaximp.chunks import Piece, make_plan, solve_all
-from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.windows import SlidingFit, sliding_least_squares, sliding_theta
 
 Numbers = NDArray[np.float64]
 
