@@ -25,8 +25,8 @@ from jaximp.least_squares import WindowFit, least_squares
 
 LANES = {True: 500, False: 1000}
 """Blocks in a chunk, with and without statistics; no power of two, which would crowd the cache."""
-REPAIR_NUMBERS = 1_000_000
-"""How many numbers of doubtful windows are decomposed at a time."""
+REPAIR_NUMBERS = 150_000
+"""How many numbers of doubtful windows are decomposed at a time: so many fit into the cache."""
 
 Numbers = NDArray[Any]
 
@@ -213,33 +213,32 @@ def _repaired(fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: N
         return fit
     fit = jax.tree.map(np.array, fit)
     at_once = max(1, REPAIR_NUMBERS // (window * len(columns)))
+    # A column that is zero throughout decides at once, and a still arm leaves many such windows.
+    nonzero = np.pad(np.cumsum(columns[:-1] != 0, axis=1), ((0, 0), (1, 0)))
+    start = doubtful * plan.step
+    fit.solvable[doubtful] = (nonzero[:, start + window] > nonzero[:, start]).all(axis=0)
+    doubtful = doubtful[fit.solvable[doubtful]]
     for first in range(0, len(doubtful), at_once):
         some = doubtful[first : first + at_once]
-        rows = (some * plan.step)[:, None] + np.arange(window)
-        windows, counts = columns[:, rows], valid[rows]  # (p + 1, m, window)
-        # A column that is zero throughout decides at once, and a still arm leaves many such windows.
-        moved = (windows[:-1] != 0).any(axis=2).all(axis=0)
-        fit.solvable[some] = moved
-        if moved.any():
-            _decompose(fit, plan, some[moved], windows[:, moved], counts[moved])
+        filled = np.pad(some, (0, at_once - len(some)), mode="edge")  # one size, compiled once
+        rows = (filled * plan.step)[:, None] + np.arange(window)
+        shape = (at_once, window // plan.outputs, plan.outputs)
+        exact = _decompose(
+            np.moveaxis(columns[:, rows], 0, -1).reshape(*shape, -1), valid[rows].reshape(shape), plan.statistics
+        )
+        for whole, part in zip(jax.tree.leaves(fit), jax.tree.leaves(exact), strict=True):
+            whole[some] = np.asarray(part)[: len(some)]
     return fit
 
 
-def _decompose(fit: ChunkFit, plan: Plan, which: NDArray[np.int64], windows: Numbers, valid: Numbers) -> None:
-    """Put the QR decomposition of these windows (p + 1, m, rows) in the place of what the chunk's triangle gave."""
-    by_sample = np.moveaxis(windows, 0, -1).reshape(len(which), -1, plan.outputs, len(windows))
-    exact = _decompositions(by_sample, valid.reshape(by_sample.shape[:-1]), fit.statistics is not None)
-    for whole, some in zip(jax.tree.leaves(fit), jax.tree.leaves(exact), strict=True):
-        whole[which] = some
-
-
 @partial(jax.jit, static_argnames="statistics")
-def _decompositions(columns: Array, valid: Array, statistics: bool) -> ChunkFit:
-    def one(window: tuple[Array, Array]) -> ChunkFit:
-        rows, counts = window
+def _decompose(columns: Array, valid: Array, statistics: bool) -> ChunkFit:
+    """QR decompositions of windows (m, samples, outputs, p + 1)."""
+
+    def one(rows: Array, counts: Array) -> ChunkFit:
         return _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts), statistics)
 
-    return lax.map(one, (columns, valid), batch_size=8)
+    return jax.vmap(one)(columns, valid)
 
 
 def _finished(fit: ChunkFit, p: int) -> Estimated:

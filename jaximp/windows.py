@@ -24,7 +24,7 @@ BATCH_NUMBERS = 4_000_000
 """How many numbers of W are gathered at a time (32 MB): windows overlap, so that all together would not fit."""
 
 
-FROM_CHUNKS = 50_000_000
+FROM_CHUNKS = 200_000_000
 """So many numbers in all windows together, and sums that windows share are worth the time they take to compile."""
 
 

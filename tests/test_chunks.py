@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from itertools import pairwise
+from operator import itemgetter
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from jaximp import windows
-from jaximp.windows import SlidingFit, sliding_least_squares, sliding_theta
+from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
 
 Numbers = NDArray[np.float64]
 
@@ -44,14 +50,12 @@ def assert_same(fit: SlidingFit, expected: SlidingFit, torque: Numbers, rtol: fl
     [
         pytest.param(1500, 100, 1, 3, (), id="every window"),
         pytest.param(1500, 97, 1, 4, (), id="of a prime length"),
-        pytest.param(1200, 5, 1, 3, (), id="shorter than a block"),
         pytest.param(1200, 3, 1, 3, (), id="as short as can be"),
         pytest.param(900, 64, 5, 3, (), id="some rows apart"),
         pytest.param(4000, 300, 47, 2, (), id="many rows apart"),
         pytest.param(900, 20, 31, 3, (), id="with gaps between them"),
         pytest.param(700, 700, 3, 3, (), id="the whole recording"),
         pytest.param(600, 50, 1, 1, (), id="one column"),
-        pytest.param(600, 50, 3, 2, (), id="two columns"),
         pytest.param(500, 40, 1, 3, (2,), id="two outputs"),
         pytest.param(500, 41, 7, 3, (3,), id="three outputs, some samples apart"),
     ],
@@ -66,3 +70,81 @@ def test_windows_are_those_of_the_qr_decomposition(
         fit = sliding_least_squares(W, y, window, step, valid=mask)
         assert_same(fit, expected, y)
         np.testing.assert_allclose(sliding_theta(W, y, window, step, valid=mask), expected.theta, 1e-9)
+
+
+def test_piece_by_piece_is_the_same_to_the_last_bit() -> None:
+    W, y = recording(20_000)
+    whole = sliding_least_squares(W, y, 60)
+    borders = [0, 7, 8, 5000, 17_000, 20_000]
+    pieces = ((W[a:b], y[a:b]) for a, b in pairwise(borders))
+    parts = list(sliding_pieces(pieces, 60))
+    assert len(parts) > 1
+    for name in SlidingFit.__annotations__:
+        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
+
+
+@pytest.mark.parametrize("pieces", [[], [(np.ones((30, 2)), np.ones(30))]], ids=["none", "too few"])
+def test_too_little_in_pieces(pieces: list[tuple[Numbers, Numbers]]) -> None:
+    with pytest.raises(ValueError, match=r"no samples|has 60 samples, but there are fewer"):
+        list(sliding_pieces(pieces, 60))
+
+
+def test_a_stretch_that_determines_nothing_harms_no_other_window() -> None:
+    W, y = recording(3000)
+    W[500:900, 2] = 2 * W[500:900, 0] - W[500:900, 1]
+    W[1500:2500, 1] = 0
+    fit, start = sliding_least_squares(W, y, 100), np.arange(2901)
+    inside = ((start >= 500) & (start <= 800)) | ((start >= 1500) & (start <= 2400))
+    np.testing.assert_array_equal(np.isnan(fit.theta).all(axis=1), inside)
+    assert_same(fit, one_by_one(W, y, 100), y)
+
+
+def test_inside_jit_vmap_and_grad() -> None:
+    W, y = (np.stack(x) for x in zip(recording(500, seed=1), recording(500, seed=2), strict=True))
+    W[0, 250:] *= 1e-6  # some windows here need a QR decomposition
+    y[0, 250:] *= 1e-6
+    both = jax.jit(jax.vmap(lambda W, y: sliding_least_squares(W, y, 40, 3)))(W, y)
+    for k in range(2):
+        assert_same(jax.tree.map(itemgetter(k), both), one_by_one(W[k], y[k], 40, 3), y[k], rtol=1e-8)
+    direction = np.random.default_rng(8).normal(size=W.shape[1:])
+
+    def loss(amount: float) -> jax.Array:
+        return (sliding_theta(W[1] + amount * direction, jnp.asarray(y[1]), 40, 3) ** 2).sum()
+
+    slope = jax.jit(jax.grad(loss))(0.0)
+    assert float(slope) == pytest.approx((float(loss(1e-6)) - float(loss(-1e-6))) / 2e-6, rel=1e-6)
+
+
+def exact_solution(W: Numbers, y: Numbers) -> Numbers:
+    """Least squares in whole numbers: without any rounding."""
+    p = W.shape[1]
+    rows = [[Fraction(float(x)) for x in row] for row in np.c_[W, y]]
+    gram = [[sum(row[i] * row[j] for row in rows) for j in range(p + 1)] for i in range(p)]
+    for i in range(p):
+        for j in range(p):
+            if j != i:
+                factor = gram[j][i] / gram[i][i]
+                gram[j] = [a - factor * b for a, b in zip(gram[j], gram[i], strict=True)]
+    return np.array([float(row[p] / row[i]) for i, row in enumerate(gram)])
+
+
+@pytest.mark.parametrize("case", ["1", "1e3", "1e5", "1e7", "units", "drop"])
+def test_as_accurate_as_the_qr_decomposition(case: str) -> None:
+    """Against the exact solution: LAPACK's QR and SVD begin with the same reduction, and share its rounding."""
+    random = np.random.default_rng(11)
+    U, _, V = np.linalg.svd(random.normal(size=(4, 4)))
+    collinear = 1.0 if case in ("units", "drop") else float(case)
+    W = random.normal(size=(3000, 4)) @ (U * np.geomspace(1, 1 / collinear, 4) @ V)
+    W *= np.geomspace(1, 1e-7, 4) if case == "units" else 1
+    W[1000:] *= 1e-6 if case == "drop" else 1
+    y = W @ np.arange(1.0, 5.0)
+    y += 0.1 * y.std() * random.normal(size=3000) * (np.abs(W).max(axis=1) if case == "drop" else 1)
+    theta = sliding_theta(W, y, 150)
+    ours, theirs = [], []
+    for start in random.choice(2851, 12, replace=False):
+        rows = slice(start, start + 150)
+        exact = exact_solution(W[rows], y[rows])
+        Q, R = np.linalg.qr(W[rows])
+        for errors, found in ((ours, theta[start]), (theirs, np.linalg.solve(R, Q.T @ y[rows]))):
+            errors.append(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+    assert max(ours) < 10 * max(theirs)
