@@ -28,6 +28,11 @@ LANES = {True: 500, False: 1000}
 REPAIR_NUMBERS = 150_000
 """How many numbers of doubtful windows are decomposed at a time: so many fit into the cache."""
 
+LONGEST_REACH = 128
+"""Rows over which noise may be correlated for shared sums to be cheaper than a decomposition of every window."""
+NEGLIGIBLE_NOISE = 1e-10
+"""Autocovariance that is no longer counted, as a share of the variance."""
+
 Numbers = NDArray[Any]
 
 
@@ -57,7 +62,9 @@ class Estimated(NamedTuple):
     samples: Any = None
 
 
-def make_plan(window: int, step: int, outputs: int, statistics: bool, n_windows: int | None = None) -> Plan:
+def make_plan(
+    window: int, step: int, outputs: int, statistics: bool, n_windows: int | None = None, lags: int = 0
+) -> Plan:
     """Sizes of a chunk for windows of so many rows, so many rows apart."""
     per_block = max(1, min(BLOCK // step, window // step))
     block = step * per_block
@@ -66,16 +73,30 @@ def make_plan(window: int, step: int, outputs: int, statistics: bool, n_windows:
     if n_windows is not None:  # a short recording needs no long chunk, but few lengths share compiled code
         wanted = -(-n_windows // per_block)
         lanes = min(lanes, next((size for size in (30, 120, 480) if size >= wanted), lanes))
-    return Plan(step, per_block, lanes, room, outputs, statistics)
+    return Plan(step, per_block, lanes, room, outputs, statistics, lags)
 
 
-def solve_all(recording: Piece, plan: Plan, window: int) -> Estimated:
+def lags_for_sums(noise: Numbers | Array | None, window: int, outputs: int) -> int | None:
+    """How many lags of the noise's autocovariance the shared sums take in; None where they cannot."""
+    if noise is None:
+        return 0
+    if noise.ndim != 1 or isinstance(noise, jax.core.Tracer):
+        return None
+    size = np.abs(np.asarray(noise))
+    lags = 1 + int(np.flatnonzero(size > NEGLIGIBLE_NOISE * size[0]).max(initial=0))
+    reach = (lags - 1) * outputs
+    return lags if lags > 1 and reach <= LONGEST_REACH and 2 * reach <= window else None
+
+
+def solve_all(recording: Piece, plan: Plan, window: int, noise: Numbers | None = None) -> Estimated:
     """Every window of a recording in memory."""
     n_windows = (len(recording.y) - window) // plan.step + 1
     found: Estimated | None = None
     with ThreadPoolExecutor(_cores()) as pool:
         starts = range(0, n_windows, plan.windows)
-        for first, part in zip(starts, pool.map(partial(_solve_at, recording, plan, window), starts), strict=True):
+        for first, part in zip(
+            starts, pool.map(partial(_solve_at, recording, plan, window, noise), starts), strict=True
+        ):
             if found is None:
                 found = jax.tree.map(lambda x: np.empty((n_windows, *x.shape[1:]), x.dtype), part)
             for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
@@ -84,19 +105,19 @@ def solve_all(recording: Piece, plan: Plan, window: int) -> Estimated:
     return found
 
 
-def solve_pieces(pieces: Iterable[Piece], plan: Plan, window: int) -> Iterator[Estimated]:
+def solve_pieces(pieces: Iterable[Piece], plan: Plan, window: int, noise: Numbers | None = None) -> Iterator[Estimated]:
     """Every window of a recording that comes piece by piece; as many pieces are held as a few chunks need."""
     waiting: deque[Future[Estimated]] = deque()
     with ThreadPoolExecutor(_cores()) as pool:
         for rows in _chunks_of(pieces, plan, window):
-            waiting.append(pool.submit(_solve_rows, plan, window, rows))
+            waiting.append(pool.submit(_solve_rows, plan, window, noise, rows))
             if len(waiting) > 2 * _cores():
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
 
 
-def solve_traced(recording: Any, plan: Plan, window: int) -> Estimated:
+def solve_traced(recording: Any, plan: Plan, window: int, noise: Array | None = None) -> Estimated:
     """Every window inside of `jit`, `vmap` or `grad`, or on an accelerator, all chunks at a time."""
     W, y, valid = recording
     n_windows = (len(y) - window) // plan.step + 1
@@ -107,16 +128,18 @@ def solve_traced(recording: Any, plan: Plan, window: int) -> Estimated:
 
     def solve(start: Array) -> ChunkFit:
         rows = lax.dynamic_slice_in_dim(columns, start, plan.rows, axis=1)
-        return solve_chunk(plan, rows, lax.dynamic_slice_in_dim(valid, start, plan.rows), window)
+        return solve_chunk(plan, rows, lax.dynamic_slice_in_dim(valid, start, plan.rows), window, noise)
 
     starts = jnp.arange(n_chunks) * plan.advance
     batch = 1 if jax.default_backend() == "cpu" else n_chunks
     fit = lax.map(solve, starts, batch_size=batch)
     fit = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n_windows], fit)
-    return _finished(_repaired_traced(fit, plan, window, columns, valid), W.shape[1])
+    return _finished(_repaired_traced(fit, plan, window, columns, valid, noise), W.shape[1])
 
 
-def _repaired_traced(fit: ChunkFit, plan: Plan, window: int, columns: Array, valid: Array) -> ChunkFit:
+def _repaired_traced(
+    fit: ChunkFit, plan: Plan, window: int, columns: Array, valid: Array, noise: Array | None
+) -> ChunkFit:
     """As `_repaired`. Values are those of the QR decomposition, derivatives those of the chunk's triangle."""
     n = plan.outputs
     fixed, columns = lax.stop_gradient((fit, columns))
@@ -128,7 +151,7 @@ def _repaired_traced(fit: ChunkFit, plan: Plan, window: int, columns: Array, val
         k = which[done]
         rows = lax.dynamic_slice_in_dim(columns, k * plan.step, window, axis=1).T.reshape(-1, n, len(columns))
         counts = lax.dynamic_slice_in_dim(valid, k * plan.step, window).reshape(-1, n)
-        exact = _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts), plan.statistics)
+        exact = _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts, noise), plan.statistics)
         return done + 1, jax.tree.map(lambda all_, one: all_.at[k].set(one), found, exact)
 
     exact = lax.while_loop(lambda state: state[0] < count, decompose, (jnp.zeros((), int), fixed))[1]
@@ -142,15 +165,18 @@ def _as_chunk_fit(exact: WindowFit, statistics: bool) -> ChunkFit:
     solvable = jnp.isfinite(exact.theta).all()
     if not statistics:
         return ChunkFit(exact.theta, solvable, jnp.array(True))
-    rss = exact.residual_rms**2 * exact.samples
-    samples = exact.samples.astype(rss.dtype)
-    high = exact.cond * exact.sigma_min
-    return ChunkFit(
-        exact.theta,
-        solvable,
-        jnp.array(True),
-        Statistics(1 / exact.excitation, high, exact.sigma_min, rss, exact.vaf, samples),
+    samples = exact.samples.astype(exact.theta.dtype)
+    found = Statistics(
+        stderr=exact.stderr,
+        dof=exact.dof,
+        inverse_norm=1 / exact.excitation,
+        sigma_max=exact.cond * exact.sigma_min,
+        sigma_min=exact.sigma_min,
+        rss=exact.residual_rms**2 * samples,
+        vaf=exact.vaf,
+        samples=samples,
     )
+    return ChunkFit(exact.theta, solvable, jnp.array(True), found)
 
 
 def _chunks_of(pieces: Iterable[Piece], plan: Plan, window: int) -> Iterator[list[Piece]]:
@@ -180,12 +206,12 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _solve_at(recording: Piece, plan: Plan, window: int, first_window: int) -> Estimated:
+def _solve_at(recording: Piece, plan: Plan, window: int, noise: Numbers | None, first_window: int) -> Estimated:
     start = first_window * plan.step
-    return _solve_rows(plan, window, [recording.part(start, start + plan.rows)])
+    return _solve_rows(plan, window, noise, [recording.part(start, start + plan.rows)])
 
 
-def _solve_rows(plan: Plan, window: int, parts: list[Piece]) -> Estimated:
+def _solve_rows(plan: Plan, window: int, noise: Numbers | None, parts: list[Piece]) -> Estimated:
     """The windows of one chunk."""
     p = parts[0].W.shape[1]
     columns = np.zeros((p + 1, plan.rows), np.result_type(*(part.W for part in parts)))
@@ -197,8 +223,8 @@ def _solve_rows(plan: Plan, window: int, parts: list[Piece]) -> Estimated:
     if not valid[:at].all():
         columns[:, ~valid] = 0  # whatever a masked sample holds
     n_windows = min(plan.windows, (at - window) // plan.step + 1)
-    fit = jax.tree.map(lambda x: np.asarray(x)[:n_windows], _compiled(plan)(columns, valid, window))
-    return _finished(_repaired(fit, plan, window, columns, valid), p)
+    fit = jax.tree.map(lambda x: np.asarray(x)[:n_windows], _compiled(plan)(columns, valid, window, noise))
+    return _finished(_repaired(fit, plan, window, columns, valid, noise), p)
 
 
 @cache
@@ -206,7 +232,9 @@ def _compiled(plan: Plan) -> Any:
     return jax.jit(partial(solve_chunk, plan), compiler_options=COMPILER_OPTIONS)
 
 
-def _repaired(fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: NDArray[np.bool_]) -> ChunkFit:
+def _repaired(
+    fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: NDArray[np.bool_], noise: Numbers | None
+) -> ChunkFit:
     """The doubtful windows by a QR decomposition each."""
     doubtful = np.flatnonzero(fit.doubtful)
     if not len(doubtful):
@@ -224,7 +252,7 @@ def _repaired(fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: N
         rows = (filled * plan.step)[:, None] + np.arange(window)
         shape = (at_once, window // plan.outputs, plan.outputs)
         exact = _decompose(
-            np.moveaxis(columns[:, rows], 0, -1).reshape(*shape, -1), valid[rows].reshape(shape), plan.statistics
+            np.moveaxis(columns[:, rows], 0, -1).reshape(*shape, -1), valid[rows].reshape(shape), noise, plan.statistics
         )
         for whole, part in zip(jax.tree.leaves(fit), jax.tree.leaves(exact), strict=True):
             whole[some] = np.asarray(part)[: len(some)]
@@ -232,11 +260,11 @@ def _repaired(fit: ChunkFit, plan: Plan, window: int, columns: Numbers, valid: N
 
 
 @partial(jax.jit, static_argnames="statistics")
-def _decompose(columns: Array, valid: Array, statistics: bool) -> ChunkFit:
+def _decompose(columns: Array, valid: Array, noise: Array | None, statistics: bool) -> ChunkFit:
     """QR decompositions of windows (m, samples, outputs, p + 1)."""
 
     def one(rows: Array, counts: Array) -> ChunkFit:
-        return _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts), statistics)
+        return _as_chunk_fit(least_squares(rows[..., :-1], rows[..., -1], counts, noise), statistics)
 
     return jax.vmap(one)(columns, valid)
 
@@ -251,12 +279,10 @@ def _finished(fit: ChunkFit, p: int) -> Estimated:
     if fit.statistics is None:
         return Estimated(or_nan(fit.theta))
     with np.errstate(all="ignore"):  # where there is no solution
-        norm, high, low, rss, vaf, n = fit.statistics
-        dof = n - p
-        noise = xp.sqrt(rss / xp.where(dof > 0, dof, xp.nan))
+        stderr, dof, norm, high, low, rss, vaf, n = fit.statistics
         return Estimated(
             theta=or_nan(fit.theta),
-            stderr=or_nan(norm * noise[:, None]),
+            stderr=or_nan(stderr),
             dof=or_nan(dof),
             cond=or_nan(high / low),
             sigma_min=or_nan(low),

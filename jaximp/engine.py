@@ -18,6 +18,10 @@ of its weight on the way is `doubtful`.
 a library. Cholesky, substitution, the two ends of the spectrum (Householder's tridiagonal form and Laguerre's
 iteration from above) cost a few operations a window.
 
+**Edges.** Noise of known autocovariance c needs sums over pairs of rows, `W'CW` and `(CW)'CW` with C the Toeplitz
+matrix of the window. With `u = c * w`, the convolution over the whole chunk, they are sums over rows again, less what
+reaches across the window's two ends; that is a product with a small Hankel matrix of c.
+
 **Barriers.** XLA would recompute a row of the triangle wherever it is used; `_keep` makes it write the row once.
 (`COMPILER_OPTIONS` keep the barriers until the code is cut into loops; without them the result is the same, slower.)
 
@@ -27,7 +31,7 @@ to the QR decomposition of `least_squares`, one by one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -66,6 +70,13 @@ class Plan(NamedTuple):
     """Rows of one sample."""
     statistics: bool
     """Whether more than theta is wanted."""
+    lags: int = 0
+    """Lags of the noise's autocovariance, none for white noise; a window has at least `2 reach` rows."""
+
+    @property
+    def reach(self) -> int:
+        """Rows over which noise is correlated."""
+        return max(self.lags - 1, 0) * self.outputs
 
     @property
     def block(self) -> int:
@@ -101,10 +112,13 @@ class ChunkFit(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """What judges an estimate, as in `least_squares.WindowFit`; (K,) but for `inverse_norm`."""
+    """What judges an estimate, as in `least_squares.WindowFit`; (K,) but where said."""
 
+    stderr: Array
+    """(K, p)"""
+    dof: Array
     inverse_norm: Array
-    """(K, p) norm of each row of the inverse triangle: reciprocal excitation, standard error for noise of size one."""
+    """(K, p) norm of each row of the inverse triangle: reciprocal excitation."""
     sigma_max: Array
     sigma_min: Array
     rss: Array
@@ -113,39 +127,43 @@ class Statistics(NamedTuple):
     samples: Array
 
 
-def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int) -> ChunkFit:
+def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, noise: Array | None = None) -> ChunkFit:
     """Fit every window of a chunk.
 
     **Arguments:** `columns` (p + 1, rows) of W and y, zero where `valid` (rows,) is False, with the rows of several
-    outputs in turn; `window` its length in rows, at least a block and at most `plan.room` blocks.
+    outputs in turn; `window` its length in rows, at most `plan.room` blocks; `noise` (lags,) its autocovariance.
     """
     p = len(columns) - 1
     X, R = _preconditioned(columns)
-    features = X if not plan.statistics else _with_statistics(X, columns[p], valid, plan.outputs)
+    features = X
+    if plan.statistics:
+        features = _keep(jnp.concatenate([X, *_for_statistics(X, columns[p], valid, plan, noise)]))
+    count = partial(_products, p=p, plan=plan)
     blocked = _in_blocks(features, plan)
     tail = _in_blocks(lax.dynamic_slice_in_dim(features, window, plan.advance, axis=1), plan)
-    first = _first_windows(blocked, plan, window, p + 1)
-    solve = partial(_solve, plan, p, R)
+    ends = _ends(features, plan, window, p) if plan.lags else None
+    first = _first_windows(blocked, plan, window, count)
 
-    def advance(
-        state: tuple[Rows, Array], leaving_and_entering: tuple[Array, Array]
-    ) -> tuple[tuple[Rows, Array], ChunkFit]:
+    def solve(sums: Rows, peak: Array, shift: Array | int) -> ChunkFit:
+        across = None if ends is None or noise is None else _across(ends, plan, shift, noise, p)
+        return _solve(plan, p, R, sums, peak, noise, across)
+
+    def advance(state: tuple[Rows, Array], step: tuple[Array, Array, Array]) -> tuple[tuple[Rows, Array], ChunkFit]:
         sums, peak = state
-        found = solve(sums, peak)
-        leaving, entering = _keep(leaving_and_entering)
+        leaving, entering, shift = _keep(step)
+        found = solve(sums, peak, shift)
         for old, new in zip(leaving, entering, strict=True):
-            less, more = _products(old, p + 1), _products(new, p + 1)
-            sums = tuple(s - a + b for s, a, b in zip(sums, less, more, strict=True))
+            sums = tuple(s - less + more for s, less, more in zip(sums, count(old), count(new), strict=True))
         sums = _keep(sums)
         return (sums, jnp.maximum(peak, _diagonal(sums, p))), found
 
     state = first, _diagonal(first, p)
     if plan.per_block == 1:
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solve(*state))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solve(*state, 0))
     leaving, entering = (
         x[:, :, : plan.lanes].reshape(plan.per_block, plan.step, len(features), plan.lanes) for x in (blocked, tail)
     )
-    found = lax.scan(advance, state, (leaving, entering))[1]
+    found = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
     return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
 
 
@@ -182,13 +200,35 @@ def _triangle_of_chunk(gram: Array, floor: float) -> Array:
     return lax.fori_loop(0, len(gram), add_row, (gram, jnp.zeros_like(gram)))[1]
 
 
-def _with_statistics(X: Array, y: Array, valid: Array, outputs: int) -> Array:
-    """Further rows: the torque less its mean over the chunk, and which output each row belongs to."""
-    output = jnp.arange(X.shape[1]) % outputs
-    member = (output == jnp.arange(outputs)[:, None]) & valid
+def _for_statistics(X: Array, y: Array, valid: Array, plan: Plan, noise: Array | None) -> tuple[Array, ...]:
+    """Further features: the torque less its mean over the chunk, and which output a row belongs to.
+
+    For coloured noise also the columns and the mask convolved with its autocovariance, and with the square of that.
+    """
+    output = jnp.arange(X.shape[1]) % plan.outputs
+    member = (output == jnp.arange(plan.outputs)[:, None]) & valid
     mean = (member * y).sum(axis=1) / jnp.maximum(member.sum(axis=1), 1)
     centred = jnp.where(valid, y - mean[output], 0)
-    return _keep(jnp.concatenate([X, centred[None], member.astype(X.dtype)]))
+    further = centred[None], member.astype(X.dtype)
+    if noise is None:
+        return further
+    mask = valid.astype(X.dtype)
+    columns = lax.stop_gradient(X[:-1])
+    return *further, _convolved(columns, noise, plan) * mask, mask[None], _convolved(mask[None], noise**2, plan) * mask
+
+
+def _convolved(x: Array, kernel: Array, plan: Plan) -> Array:
+    """Sum over lags of both signs of `kernel` times rows that many samples away; nothing lies beyond the chunk."""
+    reach, rows = plan.reach, x.shape[1]
+    padded = _keep(jnp.pad(x, ((0, 0), (reach, reach))))
+
+    def add(lag: Array, total: Array) -> Array:
+        before, behind = (
+            lax.dynamic_slice_in_dim(padded, reach + sign * lag * plan.outputs, rows, axis=1) for sign in (-1, 1)
+        )
+        return _keep(total + kernel[lag] * _keep(before + behind))
+
+    return lax.fori_loop(1, plan.lags, add, kernel[0] * x)
 
 
 def _in_blocks(x: Array, plan: Plan) -> Array:
@@ -196,40 +236,48 @@ def _in_blocks(x: Array, plan: Plan) -> Array:
     return _keep(x.reshape(len(x), -1, plan.block).transpose(2, 0, 1))
 
 
-def _products(x: Array, n_products: int) -> Rows:
+def _products(x: Array, p: int, plan: Plan) -> Rows:
     """All products that are summed over the rows of a window, of features x (features, lanes).
 
-    The upper triangle of the first `n_products` features; of those behind, the first (the centred torque) with itself,
-    and each other (the rows of one output) with all features.
+    The upper triangle of [W y]; the square of the centred torque; the rows of each output times all features before
+    them; for coloured noise the symmetric parts of `w u'` and `u u'`, and mask times convolved mask.
     """
-    triangle = tuple(x[i] * x[i:n_products] for i in range(n_products))
-    if len(x) == n_products:
+    triangle = tuple(x[i] * x[i : p + 1] for i in range(p + 1))
+    if not plan.statistics:
         return triangle
-    return (*triangle, x[n_products] * x[n_products : n_products + 1], *(member * x for member in x[n_products + 1 :]))
+    members = p + 2 + plan.outputs
+    linear = tuple(member * x[:members] for member in x[p + 2 : members])
+    white = (*triangle, x[p + 1] * x[p + 1 : p + 2], *linear)
+    if not plan.lags:
+        return white
+    w, u, (mask, convolved) = x[:p], x[members : members + p], x[members + p :]
+    once = tuple((w[i] * u[i:] + u[i] * w[i:]) / 2 for i in range(p))
+    twice = tuple(u[i] * u[i:] for i in range(p))
+    return (*white, *once, *twice, (mask * convolved)[None])
 
 
-def _first_windows(blocked: Array, plan: Plan, window: Array | int, n_products: int) -> Rows:
+def _first_windows(blocked: Array, plan: Plan, window: Array | int, count: Callable[[Array], Rows]) -> Rows:
     """Sums over the windows that begin with a block: whole blocks, and the first rows of the block behind them."""
     whole, rest = window // plan.block, window % plan.block
-    full = _sum_of_rows(blocked, n_products)
+    full = _sum_of_rows(blocked, count)
     first = _runs_of(_keep(jnp.concatenate(full)), whole, plan)
 
     def with_part(first: Array) -> Array:
         behind = lax.dynamic_slice_in_dim(blocked, whole, plan.lanes, axis=2)
         behind = _keep(behind * (jnp.arange(plan.block) < rest)[:, None, None])
-        return first + jnp.concatenate(_sum_of_rows(behind, n_products))
+        return first + jnp.concatenate(_sum_of_rows(behind, count))
 
     first = lax.cond(rest > 0, with_part, lambda first: first, first)
     ends = np.cumsum([len(group) for group in full])
     return _keep(tuple(first[end - len(group) : end] for end, group in zip(ends, full, strict=True)))
 
 
-def _sum_of_rows(blocked: Array, n_products: int) -> Rows:
+def _sum_of_rows(blocked: Array, count: Callable[[Array], Rows]) -> Rows:
     """Products of every row of a block, summed, several rows at a time."""
     at_once = next(n for n in range(BLOCK, 0, -1) if len(blocked) % n == 0)
 
     def add(rows: Array) -> Rows:
-        parts = [_products(row, n_products) for row in rows]
+        parts = [count(row) for row in rows]
         return _keep(tuple(sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True)))
 
     groups = blocked.reshape(-1, at_once, *blocked.shape[1:])
@@ -260,7 +308,59 @@ def _diagonal(sums: Rows, p: int) -> Array:
     return jnp.stack([sums[i][0] for i in range(p)])
 
 
-def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array) -> ChunkFit:
+def _ends(features: Array, plan: Plan, window: Array | int, p: int) -> tuple[Array, Array]:
+    """Rows around the beginning of every block, and around where the windows end that begin there.
+
+    (rows from `reach` before to `reach` behind a block, [w u mask], lanes)
+    """
+    members = p + 2 + plan.outputs
+    needed = jnp.concatenate([features[:p], features[members : members + p + 1]])
+    n_blocks = plan.lanes + -(-2 * plan.reach // plan.block)
+    padded = jnp.pad(needed, ((0, 0), (plan.reach, plan.reach + plan.block)))
+
+    def around(start: Array | int) -> Array:
+        blocks = _in_blocks(lax.dynamic_slice_in_dim(padded, start, n_blocks * plan.block, axis=1), plan)
+        shifts = range(1 + n_blocks - plan.lanes)
+        return _keep(jnp.concatenate([blocks[:, :, shift : shift + plan.lanes] for shift in shifts]))
+
+    return around(0), around(window)
+
+
+class Across(NamedTuple):
+    """What the sums over a window's rows hold of pairs of which only one is inside."""
+
+    once: Array
+    """(p, p, lanes)"""
+    twice: Array
+    mask: Array
+
+
+def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Array, p: int) -> Across:
+    """Pairs across both ends of the windows that begin `shift` rows behind a block's beginning."""
+    distance = np.add.outer(np.arange(plan.reach), np.arange(1, plan.reach + 1))
+    lag, aligned = distance // plan.outputs, distance % plan.outputs == 0
+    hankel = jnp.where(aligned & (lag < plan.lags), noise[np.minimum(lag, plan.lags - 1)], 0)
+    total: Across | None = None
+    for rows, mirrored in zip(ends, (False, True), strict=True):
+        before = lax.dynamic_slice_in_dim(rows, shift, plan.reach)[::-1]
+        behind = lax.dynamic_slice_in_dim(rows, shift + plan.reach, plan.reach)
+        outside, inside = _keep((behind, before) if mirrored else (before, behind))
+        w, u, mask = inside[:, :p], inside[:, p : 2 * p], inside[:, 2 * p]
+        e = _keep(jnp.tensordot(hankel, outside[:, :p], 1) * mask[:, None])
+        lost = u - e / 2
+        part = Across(
+            once=jnp.stack([(w[:, i, None] * e + e[:, i, None] * w).sum(axis=0) / 2 for i in range(p)]),
+            twice=jnp.stack([(lost[:, i, None] * e + e[:, i, None] * lost).sum(axis=0) for i in range(p)]),
+            mask=(mask * jnp.tensordot(hankel**2, outside[:, 2 * p], 1)).sum(axis=0),
+        )
+        total = _keep(part if total is None else jax.tree.map(jnp.add, total, part))
+    assert total is not None
+    return total
+
+
+def _solve(
+    plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Across | None
+) -> ChunkFit:
     """Estimates of one window in every lane, from its sums."""
     triangle = _cholesky(sums[: p + 1])
     pivots = jnp.stack([row[0] for row in triangle[:p]])
@@ -273,7 +373,17 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array) -> ChunkFit:
     theta = jnp.stack(_theta(inner, R, p))
     if not plan.statistics:
         return ChunkFit(theta, solvable, doubtful)
-    return ChunkFit(theta, solvable, doubtful, _statistics(plan, triangle, inner, R, sums))
+    rss, vaf, samples = _residuals(plan, triangle, inner, R, sums)
+    constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
+    own_inverse, given, inverse = _triangle_and_inverses(constant, R[:p, :p])
+    sigma_max, sigma_min = _extreme_singular_values(given, inverse)
+    norm = jnp.sqrt((inverse**2).sum(axis=1))
+    if across is None or noise is None:
+        dof = samples - p
+        stderr = norm * jnp.sqrt(rss / jnp.where(dof > 0, dof, jnp.nan))
+    else:
+        stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, samples)
+    return ChunkFit(theta, solvable, doubtful, Statistics(stderr, dof, norm, sigma_max, sigma_min, rss, vaf, samples))
 
 
 def _cholesky(sums: Rows) -> Rows:
@@ -309,36 +419,62 @@ def _theta(inner: list[Array], R: Array, p: int) -> list[Array]:
     return theta
 
 
-def _statistics(plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows) -> Statistics:
+def _residuals(plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows) -> tuple[Array, Array, Array]:
+    """Sum of squares, variance accounted for, and how many samples counted."""
     p = len(inner)
-    constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
-    given, inverse = _triangle_and_inverse(constant, R[:p, :p])
-    sigma_max, sigma_min = _extreme_singular_values(given, inverse)
     rss = (R[p, p] * triangle[p][0]) ** 2
-    square, by_output = sums[p + 1][0], sums[p + 2 :]
-    total, left, samples = square, rss, jnp.zeros_like(square)
-    for output, row in enumerate(by_output):
+    total, left, samples = sums[p + 1][0], rss, jnp.zeros_like(rss)
+    for output, row in enumerate(sums[p + 2 : p + 2 + plan.outputs]):
         count = row[p + 2 + output]
         residual = R[p, p] * (row[p] - sum(theta * column for theta, column in zip(inner, row, strict=False)))
         total = total - row[p + 1] ** 2 / jnp.maximum(count, 1)
         left = left - residual**2 / jnp.maximum(count, 1)
         samples = samples + count
-    vaf = jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan)
-    return Statistics(jnp.sqrt((inverse**2).sum(axis=1)), sigma_max, sigma_min, rss, vaf, samples)
+    return rss, jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan), samples
 
 
-def _triangle_and_inverse(triangle: Rows, R: Array) -> tuple[Array, Array]:
-    """The window's triangle in the given units, and its inverse; (p, p, lanes)."""
+def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Array]:
+    """Inverse of the window's triangle, the triangle in the given units, and the inverse of that; (p, p, lanes)."""
     p, scale = len(R), R[:, :, None]
     given = _keep(jnp.stack([_total(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
-    unit = jnp.eye(p, dtype=R.dtype)[:, :, None] * jnp.ones_like(given[0, 0])
-    rows = list(unit)
+    own = list(jnp.eye(p, dtype=R.dtype)[:, :, None] * jnp.ones_like(given[0, 0]))
     for i in reversed(range(p)):
-        rest = unit[i]
+        rest = own[i]
         for k in range(i + 1, p):
-            rest = rest - given[i, k] * rows[k]
-        rows[i] = _keep(rest / given[i, i])
-    return given, _keep(jnp.stack(rows))
+            rest = rest - triangle[i][k - i] * own[k]
+        own[i] = _keep(rest / triangle[i][0])
+    inverse = list(own)
+    for i in reversed(range(p)):
+        rest = own[i]
+        for k in range(i + 1, p):
+            rest = rest - R[i, k] * inverse[k]
+        inverse[i] = _keep(rest / R[i, i])
+    own_inverse, given_inverse = _keep((jnp.stack(own), jnp.stack(inverse)))
+    return own_inverse, given, given_inverse
+
+
+def _coloured(
+    plan: Plan, sums: Rows, across: Across, noise: Array, own: Array, inverse: Array, rss: Array, samples: Array
+) -> tuple[Array, Array]:
+    """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them."""
+    p = len(own)
+    coloured = sums[p + 2 + plan.outputs :]
+    once = _keep(_full(coloured[:p]) - across.once)
+    twice = _full(coloured[p : 2 * p]) - across.twice
+    half = _keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
+    shape = _keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
+    gram = jnp.stack([_total(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
+    trace = noise[0] * samples - _total(shape[i, i] for i in range(p))
+    square = coloured[2 * p][0] - across.mask - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
+    spread = _keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
+    variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))
+    return jnp.sqrt(variance), trace**2 / square
+
+
+def _full(triangle: Rows) -> Array:
+    """Symmetric (p, p, lanes) from the rows of its upper triangle."""
+    above = [[triangle[k][i - k][None] for k in range(i)] for i in range(len(triangle))]
+    return _keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))
 
 
 def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array]:

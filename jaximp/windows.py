@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Num, Shaped
 from numpy.typing import NDArray
 
-from jaximp.chunks import Estimated, Piece, make_plan, solve_all, solve_pieces, solve_traced
+from jaximp.chunks import Estimated, Piece, lags_for_sums, make_plan, solve_all, solve_pieces, solve_traced
 from jaximp.least_squares import WindowFit, check_finite, least_squares, variance_accounted_for
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray
@@ -95,10 +95,11 @@ def sliding_least_squares(
     W, y, valid = _checked(W, y, valid, window)
     starts = window_starts(len(W), window, step)
     n_windows = len(starts)
-    if noise is None and n_windows * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
-        found = _in_chunks(W, y, valid, window, step, statistics=True)
-        return SlidingFit(**found._asdict(), last=starts + window - 1)
     noise = None if noise is None else jnp.asarray(noise, W.dtype)
+    if n_windows * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
+        found = _in_chunks(W, y, valid, window, step, noise)
+        if found is not None:
+            return SlidingFit(**found._asdict(), last=starts + window - 1)
     if room is not None:
         starts = np.pad(starts, (0, len(W) // step + 1 - n_windows), mode="edge")
     fit = _solve_all(W, y, valid, noise, jnp.asarray(starts), window, room or window)
@@ -117,7 +118,7 @@ def sliding_theta(
     require_float64(W, y)
     W, y, valid = _checked(W, y, valid, window)
     if len(window_starts(len(W), window, step)) * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
-        return _in_chunks(W, y, valid, window, step, statistics=False).theta
+        return _in_chunks(W, y, valid, window, step, statistics=False).theta  # type: ignore[union-attr]
     return sliding_least_squares(W, y, window, step, valid=valid).theta
 
 
@@ -148,13 +149,23 @@ def sliding_pieces(pieces: Iterable[tuple[AnyArray, ...]], window: int, step: in
         raise ValueError(f"the window has {window} samples, but there are fewer: shorten the window")
 
 
-def _in_chunks(W: Array, y: Array, valid: Array, window: int, step: int, statistics: bool) -> Estimated:
-    """Many windows, from sums that they share."""
+def _in_chunks(
+    W: Array, y: Array, valid: Array, window: int, step: int, noise: Array | None = None, statistics: bool = True
+) -> Estimated | None:
+    """Many windows, from sums that they share; None where the noise does not allow that."""
     n, n_windows = math.prod(y.shape[1:]), (len(W) - window) // step + 1
-    plan = make_plan(window * n, step * n, n, statistics, n_windows)
+    lags = lags_for_sums(noise, window * n, n)
+    if lags is None:
+        return None
+    plan = make_plan(window * n, step * n, n, statistics, n_windows, lags)
     if any(isinstance(x, jax.core.Tracer) for x in (W, y, valid)) or jax.default_backend() != "cpu":
-        return solve_traced((W.reshape(-1, W.shape[-1]), y.ravel(), valid.ravel()), plan, window * n)
-    return solve_all(_as_piece(W, y, valid), plan, window * n)
+        return solve_traced(
+            (W.reshape(-1, W.shape[-1]), y.ravel(), valid.ravel()),
+            plan,
+            window * n,
+            None if noise is None else noise[:lags],
+        )
+    return solve_all(_as_piece(W, y, valid), plan, window * n, None if noise is None else np.asarray(noise)[:lags])
 
 
 def _as_piece(W: Array, y: Array, valid: Array) -> Piece:

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from jaximp import windows
+from jaximp.chunks import lags_for_sums
 from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
 
 Numbers = NDArray[np.float64]
@@ -70,6 +71,25 @@ def test_windows_are_those_of_the_qr_decomposition(
         fit = sliding_least_squares(W, y, window, step, valid=mask)
         assert_same(fit, expected, y)
         np.testing.assert_allclose(sliding_theta(W, y, window, step, valid=mask), expected.theta, 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("n", "window", "step", "p", "outputs", "lags"),
+    [
+        pytest.param(900, 60, 1, 3, (), 13, id="every window"),
+        pytest.param(700, 41, 1, 2, (), 21, id="as long as they may be"),
+        pytest.param(2000, 80, 33, 3, (), 13, id="some rows apart"),
+        pytest.param(500, 60, 1, 2, (2,), 9, id="two outputs"),
+    ],
+)
+def test_coloured_noise(n: int, window: int, step: int, p: int, outputs: tuple[int, ...], lags: int) -> None:
+    W, y = recording(n, p, outputs)
+    valid = np.random.default_rng(3).random(y.shape) < 0.9
+    noise = 0.8 ** np.arange(lags) * np.cos(0.5 * np.arange(lags))
+    assert lags_for_sums(noise, window * y[0].size, y[0].size) == lags
+    for mask in (None, valid):
+        fit = sliding_least_squares(W, y, window, step, valid=mask, noise=noise)
+        assert_same(fit, one_by_one(W, y, window, step, valid=mask, noise=noise), y)
 
 
 def test_piece_by_piece_is_the_same_to_the_last_bit() -> None:
