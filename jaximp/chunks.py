@@ -7,6 +7,7 @@ read piece by piece gives the same numbers, to the last bit, as one that lies in
 from __future__ import annotations
 
 import os
+import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,8 +21,10 @@ from jax import lax
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaximp.engine import BLOCK, COMPILER_OPTIONS, ChunkFit, Plan, Statistics, solve_chunk
+from jaximp.compilation import compiled
+from jaximp.engine import BLOCK, ChunkFit, Plan, Statistics, solve_chunk
 from jaximp.least_squares import WindowFit, least_squares
+from jaximp.types import AnyArray
 
 LANES = {True: 500, False: 1000}
 """Blocks in a chunk, with and without statistics; no power of two, which would crowd the cache."""
@@ -91,17 +94,23 @@ def lags_for_sums(noise: Numbers | Array | None, window: int, outputs: int) -> i
 def solve_all(recording: Piece, plan: Plan, window: int, noise: Numbers | None = None) -> Estimated:
     """Every window of a recording in memory."""
     n_windows = (len(recording.y) - window) // plan.step + 1
-    found: Estimated | None = None
+
+    def solve(first: int) -> Estimated:
+        start = first * plan.step
+        return _solve_rows(plan, window, noise, [recording.part(start, start + plan.rows)])
+
+    beginning = solve(0)
+    if n_windows <= plan.windows:
+        return beginning
+    found = jax.tree.map(lambda x: np.empty((n_windows, *x.shape[1:]), x.dtype), beginning)
+
+    def put(first: int, part: Estimated) -> None:
+        for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
+            whole[first : first + plan.windows] = some
+
+    put(0, beginning)
     with ThreadPoolExecutor(_cores()) as pool:
-        starts = range(0, n_windows, plan.windows)
-        for first, part in zip(
-            starts, pool.map(partial(_solve_at, recording, plan, window, noise), starts), strict=True
-        ):
-            if found is None:
-                found = jax.tree.map(lambda x: np.empty((n_windows, *x.shape[1:]), x.dtype), part)
-            for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
-                whole[first : first + plan.windows] = some
-    assert found is not None
+        list(pool.map(lambda first: put(first, solve(first)), range(plan.windows, n_windows, plan.windows)))
     return found
 
 
@@ -134,7 +143,7 @@ def solve_traced(recording: Any, plan: Plan, window: int, noise: Array | None = 
     batch = 1 if jax.default_backend() == "cpu" else n_chunks
     fit = lax.map(solve, starts, batch_size=batch)
     fit = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n_windows], fit)
-    return _finished(_repaired_traced(fit, plan, window, columns, valid, noise), W.shape[1])
+    return _finished(_repaired_traced(fit, plan, window, columns, valid, noise))
 
 
 def _repaired_traced(
@@ -206,30 +215,42 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _solve_at(recording: Piece, plan: Plan, window: int, noise: Numbers | None, first_window: int) -> Estimated:
-    start = first_window * plan.step
-    return _solve_rows(plan, window, noise, [recording.part(start, start + plan.rows)])
-
-
 def _solve_rows(plan: Plan, window: int, noise: Numbers | None, parts: list[Piece]) -> Estimated:
     """The windows of one chunk."""
     p = parts[0].W.shape[1]
-    columns = np.zeros((p + 1, plan.rows), np.result_type(*(part.W for part in parts)))
-    valid, at = np.zeros(plan.rows, bool), 0
+    columns, valid = _scratch(plan.rows, p + 1, np.result_type(*(part.W for part in parts)).str)
+    at = 0
     for part in parts:
         rows = slice(at, at + len(part.y))
         columns[:p, rows], columns[p, rows], valid[rows] = part.W.T, part.y, part.valid
         at = rows.stop
+    columns[:, at:], valid[at:] = 0, False
     if not valid[:at].all():
         columns[:, ~valid] = 0  # whatever a masked sample holds
     n_windows = min(plan.windows, (at - window) // plan.step + 1)
     fit = jax.tree.map(lambda x: np.asarray(x)[:n_windows], _compiled(plan)(columns, valid, window, noise))
-    return _finished(_repaired(fit, plan, window, columns, valid, noise), p)
+    return _finished(_repaired(fit, plan, window, columns, valid, noise))
+
+
+class _Memory(threading.local):
+    """Arrays of a thread, used again for the next chunk: fresh memory takes longer to come by than to fill."""
+
+    columns: Numbers = np.empty((0, 0))
+    valid: NDArray[np.bool_] = np.empty(0, bool)
+
+
+_memory = _Memory()
+
+
+def _scratch(rows: int, n_columns: int, dtype: str) -> tuple[Numbers, NDArray[np.bool_]]:
+    if _memory.columns.shape != (n_columns, rows) or _memory.columns.dtype != np.dtype(dtype):
+        _memory.columns, _memory.valid = np.empty((n_columns, rows), dtype), np.empty(rows, bool)
+    return _memory.columns, _memory.valid
 
 
 @cache
 def _compiled(plan: Plan) -> Any:
-    return jax.jit(partial(solve_chunk, plan), compiler_options=COMPILER_OPTIONS)
+    return compiled(partial(solve_chunk, plan))
 
 
 def _repaired(
@@ -259,8 +280,8 @@ def _repaired(
     return fit
 
 
-@partial(jax.jit, static_argnames="statistics")
-def _decompose(columns: Array, valid: Array, noise: Array | None, statistics: bool) -> ChunkFit:
+@partial(compiled, static_argnames="statistics")
+def _decompose(columns: AnyArray, valid: AnyArray, noise: AnyArray | None, statistics: bool) -> ChunkFit:
     """QR decompositions of windows (m, samples, outputs, p + 1)."""
 
     def one(rows: Array, counts: Array) -> ChunkFit:
@@ -269,11 +290,13 @@ def _decompose(columns: Array, valid: Array, noise: Array | None, statistics: bo
     return jax.vmap(one)(columns, valid)
 
 
-def _finished(fit: ChunkFit, p: int) -> Estimated:
+def _finished(fit: ChunkFit) -> Estimated:
     """Estimates as the user sees them; works on arrays of numpy and of jax alike."""
     xp: Any = np if isinstance(fit.theta, np.ndarray) else jnp
 
     def or_nan(x: Any) -> Any:
+        if xp is np and fit.solvable.all():
+            return x
         return xp.where(fit.solvable.reshape(-1, *(1,) * (x.ndim - 1)), x, xp.nan)
 
     if fit.statistics is None:

@@ -22,8 +22,8 @@ iteration from above) cost a few operations a window.
 matrix of the window. With `u = c * w`, the convolution over the whole chunk, they are sums over rows again, less what
 reaches across the window's two ends; that is a product with a small Hankel matrix of c.
 
-**Barriers.** XLA would recompute a row of the triangle wherever it is used; `_keep` makes it write the row once.
-(`COMPILER_OPTIONS` keep the barriers until the code is cut into loops; without them the result is the same, slower.)
+**Barriers.** XLA would recompute a row of the triangle wherever it is used; `_keep` makes it write the row once
+(if compiled by `compilation.compiled`; without it the result is the same, slower).
 
 Windows that the shared triangle does not suit (`doubtful`: the motion there differs in kind from the chunk's) are left
 to the QR decomposition of `least_squares`, one by one.
@@ -41,7 +41,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-COMPILER_OPTIONS: dict[str, Any] = {"xla_disable_hlo_passes": "cse_barrier_expander"}
 BLOCK = 16
 """Rows in a block, at least."""
 DOUBT = 1e-2
@@ -274,7 +273,8 @@ def _first_windows(blocked: Array, plan: Plan, window: Array | int, count: Calla
 
 def _sum_of_rows(blocked: Array, count: Callable[[Array], Rows]) -> Rows:
     """Products of every row of a block, summed, several rows at a time."""
-    at_once = next(n for n in range(BLOCK, 0, -1) if len(blocked) % n == 0)
+    at_once = min(len(blocked), BLOCK)
+    blocked = jnp.pad(blocked, ((0, -len(blocked) % at_once), (0, 0), (0, 0)))
 
     def add(rows: Array) -> Rows:
         parts = [count(row) for row in rows]
@@ -326,41 +326,37 @@ def _ends(features: Array, plan: Plan, window: Array | int, p: int) -> tuple[Arr
     return around(0), around(window)
 
 
-class Across(NamedTuple):
-    """What the sums over a window's rows hold of pairs of which only one is inside."""
+def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Array, p: int) -> Rows:
+    """What the sums for coloured noise hold of pairs of rows of which only one is inside the window.
 
-    once: Array
-    """(p, p, lanes)"""
-    twice: Array
-    mask: Array
-
-
-def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Array, p: int) -> Across:
-    """Pairs across both ends of the windows that begin `shift` rows behind a block's beginning."""
+    Of the windows that begin `shift` rows behind a block's beginning, and in the order of `_products`.
+    """
     distance = np.add.outer(np.arange(plan.reach), np.arange(1, plan.reach + 1))
     lag, aligned = distance // plan.outputs, distance % plan.outputs == 0
     hankel = jnp.where(aligned & (lag < plan.lags), noise[np.minimum(lag, plan.lags - 1)], 0)
-    total: Across | None = None
-    for rows, mirrored in zip(ends, (False, True), strict=True):
+
+    def lost(rows: Array, mirrored: bool) -> Array:
         before = lax.dynamic_slice_in_dim(rows, shift, plan.reach)[::-1]
         behind = lax.dynamic_slice_in_dim(rows, shift + plan.reach, plan.reach)
         outside, inside = _keep((behind, before) if mirrored else (before, behind))
-        w, u, mask = inside[:, :p], inside[:, p : 2 * p], inside[:, 2 * p]
-        e = _keep(jnp.tensordot(hankel, outside[:, :p], 1) * mask[:, None])
-        lost = u - e / 2
-        part = Across(
-            once=jnp.stack([(w[:, i, None] * e + e[:, i, None] * w).sum(axis=0) / 2 for i in range(p)]),
-            twice=jnp.stack([(lost[:, i, None] * e + e[:, i, None] * lost).sum(axis=0) for i in range(p)]),
-            mask=(mask * jnp.tensordot(hankel**2, outside[:, 2 * p], 1)).sum(axis=0),
+        mask = inside[:, 2 * p :]
+        from_columns = jnp.tensordot(hankel, outside[:, :p], 1) * mask
+        from_mask = jnp.tensordot(hankel**2, outside[:, 2 * p :], 1)
+        return jnp.concatenate(
+            [inside[:, :p], inside[:, p : 2 * p] - from_columns / 2, from_columns, mask * from_mask], 1
         )
-        total = _keep(part if total is None else jax.tree.map(jnp.add, total, part))
-    assert total is not None
-    return total
+
+    def count(x: Array) -> Rows:
+        w, u, e = x[:p], x[p : 2 * p], x[2 * p : 3 * p]
+        once = tuple((w[i] * e[i:] + e[i] * w[i:]) / 2 for i in range(p))
+        twice = tuple(u[i] * e[i:] + e[i] * u[i:] for i in range(p))
+        return (*once, *twice, x[3 * p :])
+
+    beginning, end = ends
+    return _sum_of_rows(_keep(jnp.concatenate([lost(beginning, False), lost(end, True)])), count)
 
 
-def _solve(
-    plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Across | None
-) -> ChunkFit:
+def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Rows | None) -> ChunkFit:
     """Estimates of one window in every lane, from its sums."""
     triangle = _cholesky(sums[: p + 1])
     pivots = jnp.stack([row[0] for row in triangle[:p]])
@@ -454,18 +450,17 @@ def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Arra
 
 
 def _coloured(
-    plan: Plan, sums: Rows, across: Across, noise: Array, own: Array, inverse: Array, rss: Array, samples: Array
+    plan: Plan, sums: Rows, across: Rows, noise: Array, own: Array, inverse: Array, rss: Array, samples: Array
 ) -> tuple[Array, Array]:
     """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them."""
     p = len(own)
-    coloured = sums[p + 2 + plan.outputs :]
-    once = _keep(_full(coloured[:p]) - across.once)
-    twice = _full(coloured[p : 2 * p]) - across.twice
+    within = _keep(tuple(all_ - lost for all_, lost in zip(sums[p + 2 + plan.outputs :], across, strict=True)))
+    once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
     half = _keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
     shape = _keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
     gram = jnp.stack([_total(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
     trace = noise[0] * samples - _total(shape[i, i] for i in range(p))
-    square = coloured[2 * p][0] - across.mask - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
+    square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
     spread = _keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))
     return jnp.sqrt(variance), trace**2 / square

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Integer, Num, Shaped
 from numpy.typing import NDArray
 
 from jaximp.chunks import Estimated, Piece, lags_for_sums, make_plan, solve_all, solve_pieces, solve_traced
+from jaximp.compilation import compiled
 from jaximp.least_squares import WindowFit, check_finite, least_squares, variance_accounted_for
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray
@@ -177,7 +178,7 @@ def _first_windows(tree: Any, n_windows: int) -> Any:
     return jax.tree.map(lambda x: x[:n_windows] if isinstance(x, jax.core.Tracer) else np.asarray(x)[:n_windows], tree)
 
 
-@partial(jax.jit, static_argnames="room")
+@partial(compiled, static_argnames="room")
 def _solve_all(
     W: Array, y: Array, valid: Array, noise: Array | None, starts: Array, window: int | Array, room: int
 ) -> SlidingFit:
@@ -256,7 +257,7 @@ def score(
     return scored if room is None else _first_windows(scored, n_windows)
 
 
-@partial(jax.jit, static_argnames="room")
+@partial(compiled, static_argnames="room")
 def _score_all(W: Array, y: Array, valid: Array, theta: Array, start: Array, window: int | Array, room: int) -> Score:
     def one(theta_and_start: tuple[Array, Array]) -> Score:
         parameters, first = theta_and_start

@@ -30,7 +30,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("models",),
     ("recordings", "trajectories"),
     ("signals", "readers"),
-    ("outputs", "types"),
+    ("outputs", "types", "compilation"),
 )
 """From top to bottom; a module imports from strictly lower layers, and a folder from itself."""
 
