@@ -7,6 +7,7 @@ from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -31,14 +32,21 @@ def options() -> dict[str, Any]:
 
 
 def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
-    """`jax.jit(function, **settings)`, made when it is first called: only then the device is known."""
+    """`jax.jit(function, **settings)`, made when it is first called: only then the device is known.
+
+    Within other compiled code the settings are those of that code.
+    """
+    nested = jax.jit(function, **settings)
 
     @cache
-    def jitted() -> Callable[P, R]:
+    def outermost() -> Callable[P, R]:
         return jax.jit(function, compiler_options=options(), **settings)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return jitted()(*args, **kwargs)
+        # Within `jit` every new array is traced, within `vmap` or `grad` the arguments are.
+        seen = (jnp.zeros(()), *jax.tree.leaves((args, kwargs)))
+        inside = any(isinstance(leaf, jax.core.Tracer) for leaf in seen)
+        return (nested if inside else outermost())(*args, **kwargs)
 
     return call

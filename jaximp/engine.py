@@ -22,7 +22,7 @@ iteration from above) cost a few operations a window.
 matrix of the window. With `u = c * w`, the convolution over the whole chunk, they are sums over rows again, less what
 reaches across the window's two ends; that is a product with a small Hankel matrix of c.
 
-**Barriers.** XLA would recompute a row of the triangle wherever it is used; `_keep` makes it write the row once
+**Barriers.** XLA would recompute a row of the triangle wherever it is used; `keep` makes it write the row once
 (if compiled by `compilation.compiled`; without it the result is the same, slower).
 
 Windows that the shared triangle does not suit (`doubtful`: the motion there differs in kind from the chunk's) are left
@@ -136,7 +136,7 @@ def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, n
     X, R = _preconditioned(columns)
     features = X
     if plan.statistics:
-        features = _keep(jnp.concatenate([X, *_for_statistics(X, columns[p], valid, plan, noise)]))
+        features = keep(jnp.concatenate([X, *_for_statistics(X, columns[p], valid, plan, noise)]))
     count = partial(_products, p=p, plan=plan)
     blocked = _in_blocks(features, plan)
     tail = _in_blocks(lax.dynamic_slice_in_dim(features, window, plan.advance, axis=1), plan)
@@ -149,11 +149,11 @@ def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, n
 
     def advance(state: tuple[Rows, Array], step: tuple[Array, Array, Array]) -> tuple[tuple[Rows, Array], ChunkFit]:
         sums, peak = state
-        leaving, entering, shift = _keep(step)
+        leaving, entering, shift = keep(step)
         found = solve(sums, peak, shift)
         for old, new in zip(leaving, entering, strict=True):
             sums = tuple(s - less + more for s, less, more in zip(sums, count(old), count(new), strict=True))
-        sums = _keep(sums)
+        sums = keep(sums)
         return (sums, jnp.maximum(peak, _diagonal(sums, p))), found
 
     state = first, _diagonal(first, p)
@@ -166,7 +166,7 @@ def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, n
     return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
 
 
-def _keep(x: Any) -> Any:
+def keep(x: Any) -> Any:
     """Write these numbers to memory: whoever needs them must not compute them again."""
     return lax.optimization_barrier(x)
 
@@ -176,14 +176,14 @@ def _preconditioned(columns: Array) -> tuple[Array, Array]:
 
     The estimates do not depend on R, and neither do their derivatives.
     """
-    gram = _keep(lax.stop_gradient(columns @ columns.T))
-    R = _keep(_triangle_of_chunk(gram, columns.shape[1] * float(jnp.finfo(columns.dtype).eps)))
+    gram = keep(lax.stop_gradient(columns @ columns.T))
+    R = keep(_triangle_of_chunk(gram, columns.shape[1] * float(jnp.finfo(columns.dtype).eps)))
     divided: list[Array] = []
     for j, rest in enumerate(columns):
         for i, column in enumerate(divided):
             rest = rest - R[i, j] * column
-        divided.append(_keep(rest / R[j, j]))
-    return _keep(jnp.stack(divided)), R
+        divided.append(keep(rest / R[j, j]))
+    return keep(jnp.stack(divided)), R
 
 
 def _triangle_of_chunk(gram: Array, floor: float) -> Array:
@@ -219,20 +219,20 @@ def _for_statistics(X: Array, y: Array, valid: Array, plan: Plan, noise: Array |
 def _convolved(x: Array, kernel: Array, plan: Plan) -> Array:
     """Sum over lags of both signs of `kernel` times rows that many samples away; nothing lies beyond the chunk."""
     reach, rows = plan.reach, x.shape[1]
-    padded = _keep(jnp.pad(x, ((0, 0), (reach, reach))))
+    padded = keep(jnp.pad(x, ((0, 0), (reach, reach))))
 
     def add(lag: Array, total: Array) -> Array:
         before, behind = (
             lax.dynamic_slice_in_dim(padded, reach + sign * lag * plan.outputs, rows, axis=1) for sign in (-1, 1)
         )
-        return _keep(total + kernel[lag] * _keep(before + behind))
+        return keep(total + kernel[lag] * keep(before + behind))
 
     return lax.fori_loop(1, plan.lags, add, kernel[0] * x)
 
 
 def _in_blocks(x: Array, plan: Plan) -> Array:
     """(features, rows) -> (rows of a block, features, blocks)."""
-    return _keep(x.reshape(len(x), -1, plan.block).transpose(2, 0, 1))
+    return keep(x.reshape(len(x), -1, plan.block).transpose(2, 0, 1))
 
 
 def _products(x: Array, p: int, plan: Plan) -> Rows:
@@ -259,16 +259,16 @@ def _first_windows(blocked: Array, plan: Plan, window: Array | int, count: Calla
     """Sums over the windows that begin with a block: whole blocks, and the first rows of the block behind them."""
     whole, rest = window // plan.block, window % plan.block
     full = _sum_of_rows(blocked, count)
-    first = _runs_of(_keep(jnp.concatenate(full)), whole, plan)
+    first = _runs_of(keep(jnp.concatenate(full)), whole, plan)
 
     def with_part(first: Array) -> Array:
         behind = lax.dynamic_slice_in_dim(blocked, whole, plan.lanes, axis=2)
-        behind = _keep(behind * (jnp.arange(plan.block) < rest)[:, None, None])
+        behind = keep(behind * (jnp.arange(plan.block) < rest)[:, None, None])
         return first + jnp.concatenate(_sum_of_rows(behind, count))
 
     first = lax.cond(rest > 0, with_part, lambda first: first, first)
     ends = np.cumsum([len(group) for group in full])
-    return _keep(tuple(first[end - len(group) : end] for end, group in zip(ends, full, strict=True)))
+    return keep(tuple(first[end - len(group) : end] for end, group in zip(ends, full, strict=True)))
 
 
 def _sum_of_rows(blocked: Array, count: Callable[[Array], Rows]) -> Rows:
@@ -278,14 +278,14 @@ def _sum_of_rows(blocked: Array, count: Callable[[Array], Rows]) -> Rows:
 
     def add(rows: Array) -> Rows:
         parts = [count(row) for row in rows]
-        return _keep(tuple(sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True)))
+        return keep(tuple(sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True)))
 
     groups = blocked.reshape(-1, at_once, *blocked.shape[1:])
     if len(groups) == 1:
         return add(groups[0])
 
     def accumulate(sums: Rows, rows: Array) -> tuple[Rows, None]:
-        return _keep(tuple(s + more for s, more in zip(sums, add(_keep(rows)), strict=True))), None
+        return keep(tuple(s + more for s, more in zip(sums, add(keep(rows)), strict=True))), None
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(add, groups[0]))
     return lax.scan(accumulate, nothing, groups)[0]
@@ -296,10 +296,10 @@ def _runs_of(blocks: Array, length: Array | int, plan: Plan) -> Array:
     total, done = jnp.zeros_like(blocks[:, : plan.lanes]), jnp.zeros((), int)
     for bit in range(plan.room.bit_length()):
         taken = (length >> bit) & 1
-        run = _keep(lax.dynamic_slice_in_dim(blocks, done, plan.lanes, axis=1))
+        run = keep(lax.dynamic_slice_in_dim(blocks, done, plan.lanes, axis=1))
         total, done = total + jnp.where(taken, run, 0), done + (taken << bit)
         if 2 << bit <= plan.room:
-            total, blocks = _keep((total, blocks[:, : -(1 << bit)] + blocks[:, 1 << bit :]))
+            total, blocks = keep((total, blocks[:, : -(1 << bit)] + blocks[:, 1 << bit :]))
     return total
 
 
@@ -321,7 +321,7 @@ def _ends(features: Array, plan: Plan, window: Array | int, p: int) -> tuple[Arr
     def around(start: Array | int) -> Array:
         blocks = _in_blocks(lax.dynamic_slice_in_dim(padded, start, n_blocks * plan.block, axis=1), plan)
         shifts = range(1 + n_blocks - plan.lanes)
-        return _keep(jnp.concatenate([blocks[:, :, shift : shift + plan.lanes] for shift in shifts]))
+        return keep(jnp.concatenate([blocks[:, :, shift : shift + plan.lanes] for shift in shifts]))
 
     return around(0), around(window)
 
@@ -338,7 +338,7 @@ def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Ar
     def lost(rows: Array, mirrored: bool) -> Array:
         before = lax.dynamic_slice_in_dim(rows, shift, plan.reach)[::-1]
         behind = lax.dynamic_slice_in_dim(rows, shift + plan.reach, plan.reach)
-        outside, inside = _keep((behind, before) if mirrored else (before, behind))
+        outside, inside = keep((behind, before) if mirrored else (before, behind))
         mask = inside[:, 2 * p :]
         from_columns = jnp.tensordot(hankel, outside[:, :p], 1) * mask
         from_mask = jnp.tensordot(hankel**2, outside[:, 2 * p :], 1)
@@ -353,19 +353,19 @@ def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Ar
         return (*once, *twice, x[3 * p :])
 
     beginning, end = ends
-    return _sum_of_rows(_keep(jnp.concatenate([lost(beginning, False), lost(end, True)])), count)
+    return _sum_of_rows(keep(jnp.concatenate([lost(beginning, False), lost(end, True)])), count)
 
 
 def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Rows | None) -> ChunkFit:
     """Estimates of one window in every lane, from its sums."""
-    triangle = _cholesky(sums[: p + 1])
+    triangle = cholesky(sums[: p + 1])
     pivots = jnp.stack([row[0] for row in triangle[:p]])
     # What the other columns leave of a column, in the given units, against the column itself and its rounding.
     rounding = plan.rows * jnp.finfo(R.dtype).eps
-    bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(_keep(_diagonal(sums, p)))
+    bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(keep(_diagonal(sums, p)))
     solvable = (pivots * jnp.diagonal(R)[:p, None] > rounding * bound).all(axis=0)
     doubtful = solvable & (pivots**2 <= DOUBT * peak).any(axis=0)
-    inner = _substitute(triangle, p)
+    inner = substitute(triangle, p)
     theta = jnp.stack(_theta(inner, R, p))
     if not plan.statistics:
         return ChunkFit(theta, solvable, doubtful)
@@ -382,25 +382,25 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
     return ChunkFit(theta, solvable, doubtful, Statistics(stderr, dof, norm, sigma_max, sigma_min, rss, vaf, samples))
 
 
-def _cholesky(sums: Rows) -> Rows:
+def cholesky(sums: Rows) -> Rows:
     """Upper triangle with `R'R` the given matrix, row by row; a pivot that is not positive becomes one."""
     triangle: list[Array] = []
     for j, row in enumerate(sums):
         rest = row
         for i, above in enumerate(triangle):
             rest = rest - above[j - i] * above[j - i :]
-        triangle.append(_keep(rest * lax.rsqrt(jnp.where(rest[0] > 0, rest[0], 1))))
+        triangle.append(keep(rest * lax.rsqrt(jnp.where(rest[0] > 0, rest[0], 1))))
     return tuple(triangle)
 
 
-def _substitute(triangle: Rows, p: int) -> list[Array]:
+def substitute(triangle: Rows, p: int) -> list[Array]:
     """Back through the window's triangle: the estimate in the chunk's coordinates."""
     inner: list[Array] = list(triangle[:p])
     for i in reversed(range(p)):
         rest = triangle[i][p - i]
         for k in range(i + 1, p):
             rest = rest - triangle[i][k - i] * inner[k]
-        inner[i] = _keep(rest / triangle[i][0])
+        inner[i] = keep(rest / triangle[i][0])
     return inner
 
 
@@ -411,7 +411,7 @@ def _theta(inner: list[Array], R: Array, p: int) -> list[Array]:
         rest = R[i, p] + R[p, p] * inner[i]
         for k in range(i + 1, p):
             rest = rest - R[i, k] * theta[k]
-        theta[i] = _keep(rest / R[i, i])
+        theta[i] = keep(rest / R[i, i])
     return theta
 
 
@@ -432,20 +432,20 @@ def _residuals(plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: R
 def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Array]:
     """Inverse of the window's triangle, the triangle in the given units, and the inverse of that; (p, p, lanes)."""
     p, scale = len(R), R[:, :, None]
-    given = _keep(jnp.stack([_total(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
+    given = keep(jnp.stack([_total(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
     own = list(jnp.eye(p, dtype=R.dtype)[:, :, None] * jnp.ones_like(given[0, 0]))
     for i in reversed(range(p)):
         rest = own[i]
         for k in range(i + 1, p):
             rest = rest - triangle[i][k - i] * own[k]
-        own[i] = _keep(rest / triangle[i][0])
+        own[i] = keep(rest / triangle[i][0])
     inverse = list(own)
     for i in reversed(range(p)):
         rest = own[i]
         for k in range(i + 1, p):
             rest = rest - R[i, k] * inverse[k]
-        inverse[i] = _keep(rest / R[i, i])
-    own_inverse, given_inverse = _keep((jnp.stack(own), jnp.stack(inverse)))
+        inverse[i] = keep(rest / R[i, i])
+    own_inverse, given_inverse = keep((jnp.stack(own), jnp.stack(inverse)))
     return own_inverse, given, given_inverse
 
 
@@ -454,14 +454,14 @@ def _coloured(
 ) -> tuple[Array, Array]:
     """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them."""
     p = len(own)
-    within = _keep(tuple(all_ - lost for all_, lost in zip(sums[p + 2 + plan.outputs :], across, strict=True)))
+    within = keep(tuple(all_ - lost for all_, lost in zip(sums[p + 2 + plan.outputs :], across, strict=True)))
     once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
-    half = _keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
-    shape = _keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
+    half = keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
+    shape = keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
     gram = jnp.stack([_total(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
     trace = noise[0] * samples - _total(shape[i, i] for i in range(p))
     square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
-    spread = _keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
+    spread = keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))
     return jnp.sqrt(variance), trace**2 / square
 
@@ -469,7 +469,7 @@ def _coloured(
 def _full(triangle: Rows) -> Array:
     """Symmetric (p, p, lanes) from the rows of its upper triangle."""
     above = [[triangle[k][i - k][None] for k in range(i)] for i in range(len(triangle))]
-    return _keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))
+    return keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))
 
 
 def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array]:
@@ -492,10 +492,10 @@ def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array
 
     def find(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, largest, _ = state
-        diagonal, squares = _tridiagonal(_keep(lax.cond(count == 0, gram, inverse_gram)))
+        diagonal, squares = _tridiagonal(keep(lax.cond(count == 0, gram, inverse_gram)))
         high = _largest_root(diagonal, squares, _upper_bound(diagonal, squares))
         low = -_largest_root(-diagonal, squares, jnp.zeros_like(high))
-        return _keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, 1 / high)))
+        return keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, 1 / high)))
 
     nothing = jnp.zeros_like(given[0, 0])
     _, largest, smallest = lax.while_loop(unfinished, find, (jnp.zeros((), int), nothing, nothing))
@@ -513,14 +513,14 @@ def _tridiagonal(matrix: Array) -> tuple[Array, Array]:
         head = -jnp.copysign(jnp.sqrt(square), x[0])
         half = square - head * x[0]  # half the squared length of the reflected vector
         over = jnp.where(half > 0, 1 / jnp.where(half > 0, half, 1), 0)
-        v, over = _keep((jnp.concatenate([x[:1] - head, x[1:]]), over))
+        v, over = keep((jnp.concatenate([x[:1] - head, x[1:]]), over))
         rest = matrix[1:, 1:]
-        image = _keep(_total(rest[k] * v[k] for k in range(len(v))) * over)
-        w = _keep(image - (over / 2) * (v * image).sum(axis=0) * v)
-        matrix = _keep(rest - v[:, None] * w - w[:, None] * v)
+        image = keep(_total(rest[k] * v[k] for k in range(len(v))) * over)
+        w = keep(image - (over / 2) * (v * image).sum(axis=0) * v)
+        matrix = keep(rest - v[:, None] * w - w[:, None] * v)
     diagonal += [matrix[k, k] for k in range(len(matrix))]
     squares += [matrix[0, 1] ** 2] if len(matrix) == 2 else []
-    return _keep((jnp.stack(diagonal), jnp.stack([*squares, jnp.zeros_like(diagonal[0])])))
+    return keep((jnp.stack(diagonal), jnp.stack([*squares, jnp.zeros_like(diagonal[0])])))
 
 
 def _upper_bound(diagonal: Array, squares: Array) -> Array:
@@ -551,7 +551,7 @@ def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
             first, second = first + slope, second + slope**2 - curve
         root = jnp.sqrt(jnp.maximum((p - 1) * (p * second - first**2), 0))
         step = jnp.where(above, p / (first + root), 0)
-        return _keep((value - step, step, count + 1))
+        return keep((value - step, step, count + 1))
 
     return lax.while_loop(unfinished, improve, (start, jnp.full_like(start, jnp.inf), jnp.zeros((), int)))[0]
 

@@ -9,11 +9,19 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Num, Shaped
 
+from jaximp.compilation import compiled
+from jaximp.engine import Rows, cholesky, keep, substitute
 from jaximp.least_squares import check_finite
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray
+
+SINGULAR = 1e-14
+"""What the other columns must leave of a column's square: below, rounding decides."""
+STRETCHES, SHORTEST = 1000, 50
+"""A recording is cut into so many stretches, of so many samples at least."""
 
 
 class RecursiveState(eqx.Module):
@@ -75,16 +83,55 @@ def recursive_least_squares(
     return RecursiveFit(_run(W, y, forgetting, valid))
 
 
-@jax.jit
+@compiled
 def _run(W: Array, y: Array, forgetting: float | Array, valid: Array) -> Array:
-    def advance(state: RecursiveState, sample: tuple[Array, Array, Array]) -> tuple[RecursiveState, RecursiveState]:
-        w, torque, counts = sample
-        new = _absorb(state, w, torque, forgetting)
-        new = jax.tree.map(lambda fresh, old: jnp.where(counts, fresh, old), new, state)
-        return new, new
+    """All stretches of a recording at a time: their own sums first, which give the sums that each begins with."""
+    n_samples, p = W.shape
+    length = max(SHORTEST, -(-n_samples // STRETCHES))
+    n_stretches = -(-n_samples // length)
+    rows = jnp.where(valid[:, None], jnp.concatenate([W, y[:, None]], axis=1), 0)
+    columns = jnp.concatenate([rows, jnp.where(valid, forgetting, 1.0)[:, None]], axis=1)
+    behind = n_stretches * length - n_samples
+    columns = jnp.pad(columns, ((0, behind), (0, 0)), constant_values=1)
+    stretches = keep(columns.reshape(n_stretches, length, p + 2).transpose(1, 2, 0))
 
-    states = jax.lax.scan(advance, init(W.shape[1]), (W, y, valid))[1]
-    return jax.vmap(_solve)(states)
+    def absorb(sums: Rows, row: Array) -> Rows:
+        return keep(tuple(row[p + 1] * s + row[i] * row[i : p + 1] for i, s in enumerate(sums)))
+
+    def total(state: tuple[Rows, Array], row: Array) -> tuple[tuple[Rows, Array], None]:
+        sums, decay = state
+        row = keep(row)
+        return (absorb(sums, row), keep(decay * row[p + 1])), None
+
+    def advance(sums: Rows, row: Array) -> tuple[Rows, Array]:
+        sums = absorb(sums, keep(row))
+        return sums, _theta(sums, p)
+
+    nothing = tuple(jnp.zeros((p + 1 - i, n_stretches), W.dtype) for i in range(p))
+    (sums, decay), _ = jax.lax.scan(total, (nothing, jnp.ones(n_stretches, W.dtype)), stretches)
+    theta = jax.lax.scan(advance, _sums_before(sums, decay), stretches)[1]
+    return theta.transpose(2, 0, 1).reshape(-1, p)[:n_samples]
+
+
+def _sums_before(sums: Rows, decay: Array) -> Rows:
+    """What all stretches before each one leave of their sums."""
+    flat = jnp.concatenate(sums)
+
+    def follow(before: Array, stretch: tuple[Array, Array]) -> tuple[Array, Array]:
+        own, kept = stretch
+        return kept * before + own, before
+
+    before = jax.lax.scan(follow, jnp.zeros_like(flat[:, 0]), (flat.T, decay))[1].T
+    ends = np.cumsum([len(row) for row in sums])
+    return keep(tuple(before[end - len(row) : end] for end, row in zip(ends, sums, strict=True)))
+
+
+def _theta(sums: Rows, p: int) -> Array:
+    """(p, lanes) solution of the normal equations; NaN where they are singular."""
+    triangle = cholesky(sums)
+    pivots = jnp.stack([row[0] for row in triangle])
+    solvable = (pivots**2 > SINGULAR * jnp.stack([row[0] for row in sums])).all(axis=0)
+    return jnp.where(solvable, jnp.stack(substitute(triangle, p)), jnp.nan)
 
 
 def _absorb(state: RecursiveState, w: Array, y: Array, forgetting: float | Array) -> RecursiveState:
@@ -96,7 +143,7 @@ def _solve(state: RecursiveState) -> Array:
     square = jnp.diagonal(state.information)
     size = jnp.sqrt(jnp.where(square > 0, square, 1))
     scaled = state.information / jnp.outer(size, size)
-    solvable = jnp.diagonal(jnp.linalg.cholesky(jax.lax.stop_gradient(scaled))).min() > 1e-7
+    solvable = jnp.diagonal(jnp.linalg.cholesky(jax.lax.stop_gradient(scaled))).min() ** 2 > SINGULAR
     # A singular matrix is replaced before it is factored, or its NaN would reach the gradient.
     factor = jnp.linalg.cholesky(jnp.where(solvable, scaled, jnp.eye(len(size))))
     theta = jax.scipy.linalg.cho_solve((factor, True), state.moment / size) / size
