@@ -8,7 +8,7 @@ from jaximp.recordings import load_recording, recording_from_arrays, save_record
 from jaximp.recursive import RecursiveFit, recursive_least_squares
 from jaximp.trajectories import FourierSeries
 from jaximp.types import Recording
-from jaximp.windows import SlidingFit, sliding_least_squares
+from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
 
 __all__ = [
     "Estimates",
@@ -30,4 +30,6 @@ __all__ = [
     "recursive_least_squares",
     "save_recording",
     "sliding_least_squares",
+    "sliding_pieces",
+    "sliding_theta",
 ]

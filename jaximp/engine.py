@@ -158,12 +158,13 @@ def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, n
 
     state = first, _diagonal(first, p)
     if plan.per_block == 1:
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solve(*state, 0))
+        found = jax.tree.map(lambda x: x[None], solve(*state, 0))
+        return _in_given_units(found, R, plan)
     leaving, entering = (
         x[:, :, : plan.lanes].reshape(plan.per_block, plan.step, len(features), plan.lanes) for x in (blocked, tail)
     )
     found = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
-    return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
+    return _in_given_units(found, R, plan)
 
 
 def keep(x: Any) -> Any:
@@ -360,13 +361,9 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
     """Estimates of one window in every lane, from its sums."""
     triangle = cholesky(sums[: p + 1])
     pivots = jnp.stack([row[0] for row in triangle[:p]])
-    # What the other columns leave of a column, in the given units, against the column itself and its rounding.
-    rounding = plan.rows * jnp.finfo(R.dtype).eps
-    bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(keep(_diagonal(sums, p)))
-    solvable = (pivots * jnp.diagonal(R)[:p, None] > rounding * bound).all(axis=0)
-    doubtful = solvable & (pivots**2 <= DOUBT * peak).any(axis=0)
     inner = substitute(triangle, p)
-    theta = jnp.stack(_theta(inner, R, p))
+    theta, solvable = jnp.stack(inner), _solvable(pivots, sums, R, plan.rows)
+    doubtful = (pivots**2 <= DOUBT * peak).any(axis=0)
     if not plan.statistics:
         return ChunkFit(theta, solvable, doubtful)
     rss, vaf, samples = _residuals(plan, triangle, inner, R, sums)
@@ -404,15 +401,34 @@ def substitute(triangle: Rows, p: int) -> list[Array]:
     return inner
 
 
-def _theta(inner: list[Array], R: Array, p: int) -> list[Array]:
-    """Back through the chunk's triangle: the estimate in the given units."""
-    theta = list(inner)
+def _solvable(pivots: Array, sums: Rows, R: Array, rows: int) -> Array:
+    """Whether what the other columns leave of every column is more than rounding.
+
+    Only where they leave next to nothing of a column in the whole chunk can this be known from the sums.
+    """
+    p, rounding = len(pivots), rows * jnp.finfo(R.dtype).eps
+    diagonal, size = jnp.diagonal(R)[:p], jnp.sqrt((R[:, :p] ** 2).sum(axis=0))
+    suspect = diagonal**2 <= 4 * rounding * size**2
+
+    def compare() -> Array:
+        # In the given units: pivots against the columns themselves, term by term as they were rounded.
+        bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(keep(_diagonal(sums, p)))
+        return ~(suspect[:, None] & (pivots * diagonal[:, None] <= rounding * bound)).any(axis=0)
+
+    return lax.cond(suspect.any(), compare, lambda: jnp.ones(pivots.shape[1], bool))
+
+
+def _in_given_units(found: ChunkFit, R: Array, plan: Plan) -> ChunkFit:
+    """Estimates of all windows of the chunk, one after another: back through the chunk's triangle."""
+    p = len(R) - 1
+    theta = [found.theta[:, i] for i in range(p)]
     for i in reversed(range(p)):
-        rest = R[i, p] + R[p, p] * inner[i]
+        rest = R[i, p] + R[p, p] * theta[i]
         for k in range(i + 1, p):
             rest = rest - R[i, k] * theta[k]
         theta[i] = keep(rest / R[i, i])
-    return theta
+    found = found._replace(theta=jnp.stack(theta, axis=1), doubtful=found.doubtful & found.solvable)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
 
 
 def _residuals(plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows) -> tuple[Array, Array, Array]:
