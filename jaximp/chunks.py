@@ -33,8 +33,8 @@ REPAIR_NUMBERS = 150_000
 
 LONGEST_REACH = 128
 """Rows over which noise may be correlated for shared sums to be cheaper than a decomposition of every window."""
-NEGLIGIBLE_NOISE = 1e-10
-"""Autocovariance that is no longer counted, as a share of the variance."""
+NEGLIGIBLE_NOISE = 1e-6
+"""Autocovariance that is no longer counted, as a share of the variance: standard errors feel as little of it."""
 
 Numbers = NDArray[Any]
 
@@ -71,12 +71,18 @@ def make_plan(
     """Sizes of a chunk for windows of so many rows, so many rows apart."""
     per_block = max(1, min(BLOCK // step, window // step))
     block = step * per_block
-    room = 1 << (-(-window // block) - 1).bit_length()
+    room = _rounded(-(-window // block))
     lanes = max(LANES[statistics], room)
     if n_windows is not None:  # a short recording needs no long chunk, but few lengths share compiled code
         wanted = -(-n_windows // per_block)
         lanes = min(lanes, next((size for size in (30, 120, 480) if size >= wanted), lanes))
     return Plan(step, per_block, lanes, room, outputs, statistics, lags)
+
+
+def _rounded(n: int) -> int:
+    """The next number with three binary digits: lengths that are alike share compiled code."""
+    grain = 1 << max(n.bit_length() - 3, 0)
+    return -(-n // grain) * grain
 
 
 def lags_for_sums(noise: Numbers | Array | None, window: int, outputs: int) -> int | None:
@@ -99,19 +105,24 @@ def solve_all(recording: Piece, plan: Plan, window: int, noise: Numbers | None =
         start = first * plan.step
         return _solve_rows(plan, window, noise, [recording.part(start, start + plan.rows)])
 
-    beginning = solve(0)
-    if n_windows <= plan.windows:
-        return beginning
-    found = jax.tree.map(lambda x: np.empty((n_windows, *x.shape[1:]), x.dtype), beginning)
+    found = _empty(n_windows, recording.W.shape[1], recording.W.dtype, plan.statistics)
 
-    def put(first: int, part: Estimated) -> None:
-        for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
+    def put(first: int) -> None:
+        for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(solve(first)), strict=True):
             whole[first : first + plan.windows] = some
 
-    put(0, beginning)
     with ThreadPoolExecutor(_cores()) as pool:
-        list(pool.map(lambda first: put(first, solve(first)), range(plan.windows, n_windows, plan.windows)))
+        list(pool.map(put, range(0, n_windows, plan.windows)))
     return found
+
+
+def _empty(n_windows: int, p: int, dtype: Any, statistics: bool) -> Estimated:
+    theta = np.empty((n_windows, p), dtype)
+    if not statistics:
+        return Estimated(theta)
+    each = {name: np.empty(n_windows, dtype) for name in Estimated._fields}
+    wide = {name: np.empty((n_windows, p), dtype) for name in ("stderr", "excitation")}
+    return Estimated(**each | wide | {"theta": theta, "samples": np.empty(n_windows, int)})
 
 
 def solve_pieces(pieces: Iterable[Piece], plan: Plan, window: int, noise: Numbers | None = None) -> Iterator[Estimated]:
