@@ -20,9 +20,14 @@ WANTED: dict[str, Any] = {
 
 @cache
 def options() -> dict[str, Any]:
-    """The settings that this version of XLA knows; none of them changes a result."""
-    known = {}
-    for name, value in WANTED.items() if jax.default_backend() == "cpu" else ():
+    """The settings that this version of XLA knows and needs; none of them changes a result.
+
+    From jax 0.12 on it is as fast without them, and can break off where barriers are kept.
+    """
+    known: dict[str, Any] = {}
+    if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 11):
+        return known
+    for name, value in WANTED.items():
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0).compile()
         except Exception:  # whatever a version raises for a name that it does not know
@@ -36,17 +41,27 @@ def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
 
     Within other compiled code the settings are those of that code.
     """
-    nested = jax.jit(function, **settings)
+    plain = jax.jit(function, **settings)
 
     @cache
-    def outermost() -> Callable[P, R]:
+    def tuned() -> Callable[P, R]:
         return jax.jit(function, compiler_options=options(), **settings)
+
+    refused = False
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        nonlocal refused
         # Within `jit` every new array is traced, within `vmap` or `grad` the arguments are.
         seen = (jnp.zeros(()), *jax.tree.leaves((args, kwargs)))
-        inside = any(isinstance(leaf, jax.core.Tracer) for leaf in seen)
-        return (nested if inside else outermost())(*args, **kwargs)
+        if refused or any(isinstance(leaf, jax.core.Tracer) for leaf in seen):
+            return plain(*args, **kwargs)
+        try:
+            return tuned()(*args, **kwargs)
+        except jax.errors.JaxRuntimeError as error:
+            if "opt-barrier" not in str(error):
+                raise
+            refused = True  # some versions cannot keep a barrier inside of a small loop
+            return plain(*args, **kwargs)
 
     return call

@@ -412,7 +412,7 @@ def _solvable(pivots: Array, sums: Rows, R: Array, rows: int) -> Array:
 
     def compare() -> Array:
         # In the given units: pivots against the columns themselves, term by term as they were rounded.
-        bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(keep(_diagonal(sums, p)))
+        bound = jnp.abs(R[:p, :p]).T @ jnp.sqrt(_diagonal(sums, p))
         return ~(suspect[:, None] & (pivots * diagonal[:, None] <= rounding * bound)).any(axis=0)
 
     return lax.cond(suspect.any(), compare, lambda: jnp.ones(pivots.shape[1], bool))
