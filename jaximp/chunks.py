@@ -143,8 +143,8 @@ def solve_traced(recording: Any, plan: Plan, window: int, noise: Array | None = 
     n_windows = (len(y) - window) // plan.step + 1
     n_chunks = -(-n_windows // plan.windows)
     columns = jnp.where(valid, jnp.concatenate([W.T, y[None]]), 0)
-    behind = n_chunks * plan.advance + plan.rows - plan.advance - len(y)
-    columns, valid = jnp.pad(columns, ((0, 0), (0, max(behind, 0)))), jnp.pad(valid, (0, max(behind, 0)))
+    behind = max(0, (n_chunks - 1) * plan.advance + plan.rows - len(y))
+    columns, valid = jnp.pad(columns, ((0, 0), (0, behind))), jnp.pad(valid, (0, behind))
 
     def solve(start: Array) -> ChunkFit:
         rows = lax.dynamic_slice_in_dim(columns, start, plan.rows, axis=1)
@@ -175,9 +175,13 @@ def _repaired_traced(
         return done + 1, jax.tree.map(lambda all_, one: all_.at[k].set(one), found, exact)
 
     exact = lax.while_loop(lambda state: state[0] < count, decompose, (jnp.zeros((), int), fixed))[1]
-    return jax.tree.map(
-        lambda x, old, new: x if x.dtype == bool else jnp.where(new == old, x, x - old + new), fit, fixed, exact
-    )._replace(solvable=exact.solvable)
+
+    def with_derivative(x: Array, old: Array, new: Array) -> Array:
+        if x.dtype == bool:
+            return new
+        return jnp.where(new == old, x, jnp.where(jnp.isfinite(old), x - old, 0) + new)
+
+    return jax.tree.map(with_derivative, fit, fixed, exact)
 
 
 def _as_chunk_fit(exact: WindowFit, statistics: bool) -> ChunkFit:

@@ -119,7 +119,9 @@ def sliding_theta(
     require_float64(W, y)
     W, y, valid = _checked(W, y, valid, window)
     if len(window_starts(len(W), window, step)) * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
-        return _in_chunks(W, y, valid, window, step, statistics=False).theta  # type: ignore[union-attr]
+        found = _in_chunks(W, y, valid, window, step, statistics=False)
+        if found is not None:
+            return found.theta
     return sliding_least_squares(W, y, window, step, valid=valid).theta
 
 
