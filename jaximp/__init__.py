@@ -3,12 +3,12 @@
 from jaximp import models
 from jaximp.identify import Estimates, identify, identify_recording
 from jaximp.job import Job, parse_job, read_job
-from jaximp.least_squares import WindowFit, confidence_interval, least_squares
+from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
 from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.recursive import RecursiveFit, recursive_least_squares
 from jaximp.trajectories import FourierSeries
 from jaximp.types import Recording
-from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
 __all__ = [
     "Estimates",
@@ -18,6 +18,7 @@ __all__ = [
     "RecursiveFit",
     "SlidingFit",
     "WindowFit",
+    "adaptive_least_squares",
     "confidence_interval",
     "identify",
     "identify_recording",

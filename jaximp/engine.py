@@ -69,6 +69,8 @@ class Plan(NamedTuple):
     """Rows of one sample."""
     statistics: bool
     """Whether more than theta is wanted."""
+    weighted: bool
+    """Whether rows have weights: then they are not their own count."""
     lags: int = 0
     """Lags of the noise's autocovariance, none for white noise; a window has at least `2 reach` rows."""
 
@@ -105,9 +107,14 @@ class ChunkFit(NamedTuple):
     """(K, p), meaningless where `solvable` is False."""
     solvable: Array
     """(K,) False where there is no unique solution."""
-    doubtful: Array
-    """(K,) True where the numbers may be wrong and a QR decomposition must decide."""
+    share: Array
+    """(K,) what the other columns leave of the one that they imitate best, squared and in the chunk's coordinates."""
     statistics: Statistics | None = None
+
+    @property
+    def doubtful(self) -> Any:
+        """(K,) True where the numbers may be wrong and a QR decomposition must decide."""
+        return self.solvable & (self.share <= DOUBT)
 
 
 class Statistics(NamedTuple):
@@ -120,27 +127,28 @@ class Statistics(NamedTuple):
     """(K, p) norm of each row of the inverse triangle: reciprocal excitation."""
     sigma_max: Array
     sigma_min: Array
-    rss: Array
-    """Residual sum of squares."""
+    mean_square: Array
+    """Of the residual."""
     vaf: Array
     samples: Array
 
 
-def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, noise: Array | None = None) -> ChunkFit:
+def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, noise: Array | None = None) -> ChunkFit:
     """Fit every window of a chunk.
 
-    **Arguments:** `columns` (p + 1, rows) of W and y, zero where `valid` (rows,) is False, with the rows of several
-    outputs in turn; `window` its length in rows, at most `plan.room` blocks; `noise` (lags,) its autocovariance.
+    **Arguments:** `columns` (p + 1, rows) of W and y, with the rows of several outputs in turn, multiplied by `scale`
+    (rows,): zero where a row does not count, else the root of its weight; `window` its length in rows, at most
+    `plan.room` blocks; `noise` (lags,) its autocovariance.
     """
     p = len(columns) - 1
-    X, R = _preconditioned(columns)
-    features = X
-    if plan.statistics:
-        features = keep(jnp.concatenate([X, *_for_statistics(X, columns[p], valid, plan, noise)]))
+    features, R = _features(plan, columns, scale, noise)
     count = partial(_products, p=p, plan=plan)
     blocked = _in_blocks(features, plan)
     tail = _in_blocks(lax.dynamic_slice_in_dim(features, window, plan.advance, axis=1), plan)
-    ends = _ends(features, plan, window, p) if plan.lags else None
+    ends = None
+    if plan.lags:
+        around = _ends(features, plan, p)
+        ends = around(0), around(window)
     first = _first_windows(blocked, plan, window, count)
 
     def solve(sums: Rows, peak: Array, shift: Array | int) -> ChunkFit:
@@ -167,9 +175,82 @@ def solve_chunk(plan: Plan, columns: Array, valid: Array, window: Array | int, n
     return _in_given_units(found, R, plan)
 
 
+class Wanted(NamedTuple):
+    """What a window must reach to be long enough."""
+
+    blocks: Any
+    """(m,) lengths to choose from, rising, in blocks."""
+    stderr: Any
+    """(p,) largest standard errors."""
+    cond: Any
+    """() largest condition number."""
+
+
+def solve_shortest(
+    plan: Plan, columns: Array, scale: Array, wanted: Wanted, noise: Array | None = None
+) -> tuple[ChunkFit, Array]:
+    """Fit, up to the end of every block from `plan.room - 1` on, the shortest window that meets what is wanted.
+
+    Windows grow back in time block by block, so that the sums of a length are those of the one before it and a few
+    more. A plan for this has one window in a block. Arguments as in `solve_chunk`.
+
+    **Returns:** the fits, and how many blocks each took: none where no length sufficed.
+    """
+    p, wanted = len(columns) - 1, jax.tree.map(jnp.asarray, wanted)
+    features, R = _features(plan, columns, scale, noise)
+    groups = _sum_of_rows(_in_blocks(features, plan), partial(_products, p=p, plan=plan))
+    blocks, split = keep(jnp.concatenate(groups)), np.cumsum([len(group) for group in groups])[:-1]
+    ends = _ends(features, plan, p) if plan.lags else None
+    last = ends(plan.room * plan.block) if ends else jnp.zeros(0)
+
+    def grow(before: Array, total: Array) -> Array:
+        return total + keep(lax.dynamic_slice_in_dim(blocks, plan.room - 1 - before, plan.lanes, axis=1))
+
+    def fit_of(length: Array, total: Array) -> ChunkFit:
+        sums, across = keep(tuple(jnp.split(total, split))), None
+        if ends is not None and noise is not None:
+            across = _across((ends((plan.room - length) * plan.block), last), plan, 0, noise, p)
+        return _solve(plan, p, R, sums, _diagonal(sums, p), noise, across)
+
+    def unfinished(state: tuple[Array, Array, Array, ChunkFit]) -> Array:
+        return (state[0] < len(wanted.blocks)) & (state[2] == 0).any()
+
+    def lengthen(state: tuple[Array, Array, Array, ChunkFit]) -> tuple[Array, Array, Array, ChunkFit]:
+        k, total, taken, found = state
+        length = wanted.blocks[k]
+        total = keep(lax.fori_loop(jnp.where(k > 0, wanted.blocks[k - 1], 0), length, grow, total))
+        fit = fit_of(length, total)
+        better = (taken == 0) & _meets(fit, wanted)
+        found = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, found)
+        return keep((k + 1, total, jnp.where(better, length, taken), found))
+
+    none, total = jnp.zeros((), wanted.blocks.dtype), jnp.zeros_like(blocks[:, : plan.lanes])
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fit_of, none, total))
+    state = none, total, jnp.zeros(plan.lanes, wanted.blocks.dtype), nothing
+    _, _, taken, found = lax.while_loop(unfinished, lengthen, state)
+    found = found._replace(solvable=taken > 0)
+    return _in_given_units(jax.tree.map(lambda x: x[None], found), R, plan), taken
+
+
+def _meets(fit: ChunkFit, wanted: Wanted) -> Array:
+    """Whether a window is long enough, and its standard error more than rounding."""
+    assert fit.statistics is not None
+    accurate = fit.share > jnp.sqrt(jnp.finfo(fit.theta.dtype).eps)
+    sure = (fit.statistics.stderr <= wanted.stderr[:, None]).all(axis=0)
+    return fit.solvable & accurate & sure & (fit.statistics.sigma_max <= wanted.cond * fit.statistics.sigma_min)
+
+
 def keep(x: Any) -> Any:
     """Write these numbers to memory: whoever needs them must not compute them again."""
     return lax.optimization_barrier(x)
+
+
+def _features(plan: Plan, columns: Array, scale: Array, noise: Array | None) -> tuple[Array, Array]:
+    """Everything of which products are summed, (features, rows), and the chunk's triangle R."""
+    X, R = _preconditioned(columns)
+    if not plan.statistics:
+        return X, R
+    return keep(jnp.concatenate([X, *_for_statistics(X, columns[-1], scale, plan, noise)])), R
 
 
 def _preconditioned(columns: Array) -> tuple[Array, Array]:
@@ -200,21 +281,23 @@ def _triangle_of_chunk(gram: Array, floor: float) -> Array:
     return lax.fori_loop(0, len(gram), add_row, (gram, jnp.zeros_like(gram)))[1]
 
 
-def _for_statistics(X: Array, y: Array, valid: Array, plan: Plan, noise: Array | None) -> tuple[Array, ...]:
+def _for_statistics(X: Array, y: Array, scale: Array, plan: Plan, noise: Array | None) -> tuple[Array, ...]:
     """Further features: the torque less its mean over the chunk, and which output a row belongs to.
 
-    For coloured noise also the columns and the mask convolved with its autocovariance, and with the square of that.
+    For weights also which rows count; for coloured noise the columns convolved with its autocovariance, the root of the
+    weights, and the weights and those convolved with the square of it.
     """
     output = jnp.arange(X.shape[1]) % plan.outputs
-    member = (output == jnp.arange(plan.outputs)[:, None]) & valid
-    mean = (member * y).sum(axis=1) / jnp.maximum(member.sum(axis=1), 1)
-    centred = jnp.where(valid, y - mean[output], 0)
-    further = centred[None], member.astype(X.dtype)
+    counts, scale = scale > 0, scale.astype(X.dtype)
+    member = jnp.where(output == jnp.arange(plan.outputs)[:, None], scale, 0)
+    mean = (member * y).sum(axis=1) / jnp.maximum((member**2).sum(axis=1), jnp.finfo(y.dtype).tiny)
+    further = [(y - mean[output] * scale)[None], member]
+    if plan.weighted:
+        further.append(counts.astype(X.dtype)[None])
     if noise is None:
-        return further
-    mask = valid.astype(X.dtype)
-    columns = lax.stop_gradient(X[:-1])
-    return *further, _convolved(columns, noise, plan) * mask, mask[None], _convolved(mask[None], noise**2, plan) * mask
+        return tuple(further)
+    columns, weight = lax.stop_gradient(X[:-1]) * scale, scale[None] ** 2
+    return *further, _convolved(columns, noise, plan) * scale, scale[None], weight, _convolved(weight, noise**2, plan)
 
 
 def _convolved(x: Array, kernel: Array, plan: Plan) -> Array:
@@ -240,20 +323,21 @@ def _products(x: Array, p: int, plan: Plan) -> Rows:
     """All products that are summed over the rows of a window, of features x (features, lanes).
 
     The upper triangle of [W y]; the square of the centred torque; the rows of each output times all features before
-    them; for coloured noise the symmetric parts of `w u'` and `u u'`, and mask times convolved mask.
+    them; with weights how many rows count; for coloured noise the symmetric parts of `w u'` and `u u'`, and the weight
+    times the convolved weights.
     """
     triangle = tuple(x[i] * x[i : p + 1] for i in range(p + 1))
     if not plan.statistics:
         return triangle
     members = p + 2 + plan.outputs
     linear = tuple(member * x[:members] for member in x[p + 2 : members])
-    white = (*triangle, x[p + 1] * x[p + 1 : p + 2], *linear)
+    white = (*triangle, x[p + 1] * x[p + 1 : p + 2], *linear, *([x[members][None]] if plan.weighted else []))
     if not plan.lags:
         return white
-    w, u, (mask, convolved) = x[:p], x[members : members + p], x[members + p :]
+    w, u, (_, weight, convolved) = x[:p], x[-p - 3 : -3], x[-3:]
     once = tuple((w[i] * u[i:] + u[i] * w[i:]) / 2 for i in range(p))
     twice = tuple(u[i] * u[i:] for i in range(p))
-    return (*white, *once, *twice, (mask * convolved)[None])
+    return (*white, *once, *twice, (weight * convolved)[None])
 
 
 def _first_windows(blocked: Array, plan: Plan, window: Array | int, count: Callable[[Array], Rows]) -> Rows:
@@ -309,13 +393,12 @@ def _diagonal(sums: Rows, p: int) -> Array:
     return jnp.stack([sums[i][0] for i in range(p)])
 
 
-def _ends(features: Array, plan: Plan, window: Array | int, p: int) -> tuple[Array, Array]:
-    """Rows around the beginning of every block, and around where the windows end that begin there.
+def _ends(features: Array, plan: Plan, p: int) -> Callable[[Array | int], Array]:
+    """A function that gives the rows around a row, and around those one block, two blocks, ... behind it.
 
-    (rows from `reach` before to `reach` behind a block, [w u mask], lanes)
+    (rows from `reach` before to `reach` behind, [w u scale], lanes)
     """
-    members = p + 2 + plan.outputs
-    needed = jnp.concatenate([features[:p], features[members : members + p + 1]])
+    needed = jnp.concatenate([features[:p], features[-p - 3 : -2]])
     n_blocks = plan.lanes + -(-2 * plan.reach // plan.block)
     padded = jnp.pad(needed, ((0, 0), (plan.reach, plan.reach + plan.block)))
 
@@ -324,7 +407,7 @@ def _ends(features: Array, plan: Plan, window: Array | int, p: int) -> tuple[Arr
         shifts = range(1 + n_blocks - plan.lanes)
         return keep(jnp.concatenate([blocks[:, :, shift : shift + plan.lanes] for shift in shifts]))
 
-    return around(0), around(window)
+    return around
 
 
 def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Array, p: int) -> Rows:
@@ -340,12 +423,10 @@ def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Ar
         before = lax.dynamic_slice_in_dim(rows, shift, plan.reach)[::-1]
         behind = lax.dynamic_slice_in_dim(rows, shift + plan.reach, plan.reach)
         outside, inside = keep((behind, before) if mirrored else (before, behind))
-        mask = inside[:, 2 * p :]
-        from_columns = jnp.tensordot(hankel, outside[:, :p], 1) * mask
-        from_mask = jnp.tensordot(hankel**2, outside[:, 2 * p :], 1)
-        return jnp.concatenate(
-            [inside[:, :p], inside[:, p : 2 * p] - from_columns / 2, from_columns, mask * from_mask], 1
-        )
+        scale, outer_scale = inside[:, 2 * p :], outside[:, 2 * p :]
+        from_columns = jnp.tensordot(hankel, outside[:, :p] * outer_scale, 1) * scale
+        from_weights = jnp.tensordot(hankel**2, outer_scale**2, 1) * scale**2
+        return jnp.concatenate([inside[:, :p], inside[:, p : 2 * p] - from_columns / 2, from_columns, from_weights], 1)
 
     def count(x: Array) -> Rows:
         w, u, e = x[:p], x[p : 2 * p], x[2 * p : 3 * p]
@@ -363,10 +444,10 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
     pivots = jnp.stack([row[0] for row in triangle[:p]])
     inner = substitute(triangle, p)
     theta, solvable = jnp.stack(inner), _solvable(pivots, sums, R, plan.rows)
-    doubtful = (pivots**2 <= DOUBT * peak).any(axis=0)
+    share = (pivots**2 / jnp.where(peak > 0, peak, 1)).min(axis=0)
     if not plan.statistics:
-        return ChunkFit(theta, solvable, doubtful)
-    rss, vaf, samples = _residuals(plan, triangle, inner, R, sums)
+        return ChunkFit(theta, solvable, share)
+    rss, vaf, weight, samples = _residuals(plan, triangle, inner, R, sums)
     constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
     own_inverse, given, inverse = _triangle_and_inverses(constant, R[:p, :p])
     sigma_max, sigma_min = _extreme_singular_values(given, inverse)
@@ -375,8 +456,9 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
         dof = samples - p
         stderr = norm * jnp.sqrt(rss / jnp.where(dof > 0, dof, jnp.nan))
     else:
-        stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, samples)
-    return ChunkFit(theta, solvable, doubtful, Statistics(stderr, dof, norm, sigma_max, sigma_min, rss, vaf, samples))
+        stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, weight)
+    statistics = Statistics(stderr, dof, norm, sigma_max, sigma_min, rss / weight, vaf, samples)
+    return ChunkFit(theta, solvable, share, statistics)
 
 
 def cholesky(sums: Rows) -> Rows:
@@ -427,22 +509,24 @@ def _in_given_units(found: ChunkFit, R: Array, plan: Plan) -> ChunkFit:
         for k in range(i + 1, p):
             rest = rest - R[i, k] * theta[k]
         theta[i] = keep(rest / R[i, i])
-    found = found._replace(theta=jnp.stack(theta, axis=1), doubtful=found.doubtful & found.solvable)
+    found = found._replace(theta=jnp.stack(theta, axis=1))
     return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
 
 
-def _residuals(plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows) -> tuple[Array, Array, Array]:
-    """Sum of squares, variance accounted for, and how many samples counted."""
-    p = len(inner)
+def _residuals(
+    plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows
+) -> tuple[Array, Array, Array, Array]:
+    """Sum of squares, variance accounted for, sum of the weights, and how many samples counted."""
+    p, members = len(inner), sums[len(inner) + 2 :]
     rss = (R[p, p] * triangle[p][0]) ** 2
-    total, left, samples = sums[p + 1][0], rss, jnp.zeros_like(rss)
-    for output, row in enumerate(sums[p + 2 : p + 2 + plan.outputs]):
-        count = row[p + 2 + output]
+    total, left, whole = sums[p + 1][0], rss, jnp.zeros_like(rss)
+    for output, row in enumerate(members[: plan.outputs]):
+        weight = row[p + 2 + output]
         residual = R[p, p] * (row[p] - sum(theta * column for theta, column in zip(inner, row, strict=False)))
-        total = total - row[p + 1] ** 2 / jnp.maximum(count, 1)
-        left = left - residual**2 / jnp.maximum(count, 1)
-        samples = samples + count
-    return rss, jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan), samples
+        over = 1 / jnp.where(weight > 0, weight, 1)
+        total, left, whole = total - row[p + 1] ** 2 * over, left - residual**2 * over, whole + weight
+    samples = members[plan.outputs][0] if plan.weighted else whole
+    return rss, jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan), whole, samples
 
 
 def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Array]:
@@ -466,16 +550,16 @@ def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Arra
 
 
 def _coloured(
-    plan: Plan, sums: Rows, across: Rows, noise: Array, own: Array, inverse: Array, rss: Array, samples: Array
+    plan: Plan, sums: Rows, across: Rows, noise: Array, own: Array, inverse: Array, rss: Array, weight: Array
 ) -> tuple[Array, Array]:
     """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them."""
     p = len(own)
-    within = keep(tuple(all_ - lost for all_, lost in zip(sums[p + 2 + plan.outputs :], across, strict=True)))
+    within = keep(tuple(all_ - lost for all_, lost in zip(sums[-len(across) :], across, strict=True)))
     once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
     half = keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
     shape = keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
     gram = jnp.stack([_total(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
-    trace = noise[0] * samples - _total(shape[i, i] for i in range(p))
+    trace = noise[0] * weight - _total(shape[i, i] for i in range(p))
     square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
     spread = keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))

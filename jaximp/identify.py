@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaximp import signals
 from jaximp.job import Job
-from jaximp.least_squares import WindowFit
+from jaximp.least_squares import SlidingFit, WindowFit
 from jaximp.models import Joints, Model, combine
 from jaximp.payload import METHODS, Regression, fit_robot, separate
 from jaximp.regression import (
@@ -35,7 +35,7 @@ from jaximp.regression import (
 )
 from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import Progress, Recording, nearest
-from jaximp.windows import SlidingFit, score, sliding_least_squares
+from jaximp.windows import score, sliding_least_squares
 
 
 @dataclass(frozen=True)
@@ -228,6 +228,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         residual_rms=jnp.sqrt((stacked("residual_rms") ** 2).mean(axis=0)),
         vaf=stacked("vaf").min(axis=0),
         samples=stacked("samples").sum(axis=0),
+        first=fits[0].first,
         last=fits[0].last,
     )
     thresholds = [part.threshold for part in parts if part.threshold is not None]

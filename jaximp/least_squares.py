@@ -22,32 +22,43 @@ SWEEPS = 10
 """Times that every pair of columns is turned against each other; the error falls with its square every time."""
 
 
-class WindowFit(eqx.Module):
-    """The estimate of one window. Where the window has no unique solution everything is NaN, `samples` apart."""
+class Fit(eqx.Module):
+    """The estimate of one window, or of M. A window without a unique solution is NaN throughout, `samples` apart."""
 
-    theta: Float[Array, "*M p"]
+    theta: Float[AnyArray, "*M p"]
     """Parameters, in the model's units."""
-    covariance: Float[Array, "*M p p"]
-    """Covariance of theta."""
-    dof: Float[Array, "*M"]
+    stderr: Float[AnyArray, "*M p"]
+    """Their standard errors."""
+    dof: Float[AnyArray, "*M"]
     """Degrees of freedom of the variance estimate: a quantile of Student's t with so many makes the interval."""
-    cond: Float[Array, "*M"]
+    cond: Float[AnyArray, "*M"]
     """Condition number of W: largest over smallest singular value."""
-    sigma_min: Float[Array, "*M"]
+    sigma_min: Float[AnyArray, "*M"]
     """Smallest singular value of W."""
-    excitation: Float[Array, "*M p"]
+    excitation: Float[AnyArray, "*M p"]
     """Norm of each column's part that the other columns cannot imitate."""
-    residual_rms: Float[Array, "*M"]
-    """Root of the mean squared residual [N m]."""
-    vaf: Float[Array, "*M"]
+    residual_rms: Float[AnyArray, "*M"]
+    """Root of the (weighted) mean squared residual [N m]."""
+    vaf: Float[AnyArray, "*M"]
     """Variance accounted for, 1 - var(residual)/var(torque): a constant torque earns nothing."""
-    samples: Int[Array, "*M"]
+    samples: Int[AnyArray, "*M"]
     """How many torque samples counted."""
 
-    @property
-    def stderr(self) -> Float[Array, "*M p"]:
-        """Standard error of each parameter."""
-        return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+class WindowFit(Fit):
+    """The estimate of one window, with what its parameters have in common."""
+
+    covariance: Float[Array, "*M p p"]
+    """Covariance of theta."""
+
+
+class SlidingFit(Fit):
+    """The estimates of M windows, with where each of them lies."""
+
+    first: Int[AnyArray, "*M"]
+    """Index of each window's first sample."""
+    last: Int[AnyArray, "*M"]
+    """Index of each window's last sample."""
 
 
 def least_squares(
@@ -55,12 +66,15 @@ def least_squares(
     y: Num[AnyArray, "S *n"],
     valid: Shaped[AnyArray, "S *n"] | None = None,
     noise: Num[AnyArray, " L"] | Num[AnyArray, "S S"] | None = None,
+    *,
+    weights: Num[AnyArray, "S *n"] | None = None,
 ) -> WindowFit:
     """Fit `y = W @ theta + noise` over the valid samples of one window.
 
-    **Arguments:** `W` (S, p) or (S, n, p); `y` (S,) or (S, n) [N m]; `valid` False for samples that must not count.
-    `noise` is what is known of the noise: its autocovariance by lag (`signals.autocovariance`), or the covariance
-    matrix of the rows, up to a factor; without it the noise is taken as white.
+    **Arguments:** `W` (S, p) or (S, n, p); `y` (S,) or (S, n) [N m]; `valid` False for samples that must not count;
+    `weights` of the squared residuals. `noise` is what is known of the noise: its autocovariance by lag
+    (`signals.autocovariance`), or the covariance matrix of the rows, up to a factor; without it the noise is taken as
+    white, with weights of a variance in inverse proportion to them.
 
     **Returns:** a `WindowFit`. White noise gives the textbook standard errors, residual sum of squares over
     (samples - p). Known noise of covariance s^2 F F' gives `s^2 A F F' A'` with A the pseudo-inverse of W,
@@ -69,11 +83,23 @@ def least_squares(
 
     **Source:** the estimator of Tout et al. 2023, III-B; Satterthwaite 1946 for the degrees of freedom.
     """
+    scale = jnp.ones(y.shape, bool) if valid is None else jnp.asarray(valid, bool)
+    return solve_window(W, y, scale if weights is None else root_of_weights(weights, scale), noise)
+
+
+def root_of_weights(weights: AnyArray, valid: AnyArray) -> Array:
+    """What each equation is multiplied by: zero where it does not count. (The root has no derivative there.)"""
+    counts = valid & (weights > 0)
+    return jnp.where(counts, jnp.sqrt(jnp.where(counts, weights, 1)), 0)
+
+
+def solve_window(W: AnyArray, y: AnyArray, scale: AnyArray, noise: AnyArray | None) -> WindowFit:
+    """As `least_squares`, with what each equation is multiplied by: False, True, or the root of its weight."""
     n_samples, p = W.shape[0], W.shape[-1]
-    weight = jnp.ones(y.shape, W.dtype) if valid is None else jnp.asarray(valid, W.dtype)
-    W, y = jnp.where(weight[..., None] > 0, W, 0), jnp.where(weight > 0, y, 0)  # whatever a masked sample holds
-    rows, torque, kept = W.reshape(-1, p), y.reshape(-1), weight.reshape(-1)
-    n = kept.sum()
+    scale = jnp.asarray(scale, W.dtype)
+    W, y = jnp.where(scale[..., None] > 0, W, 0), jnp.where(scale > 0, y, 0)  # whatever a masked sample holds
+    rows, torque = (W * scale[..., None]).reshape(-1, p), (y * scale).reshape(-1)
+    n, weight = (scale > 0).sum().astype(W.dtype), scale**2
 
     Q, R, independent = _orthonormal(rows)
     singular = _singular_values(R)
@@ -87,19 +113,21 @@ def least_squares(
         dof = n - p
         spread = jnp.eye(p, dtype=R.dtype) * rss / jnp.where(dof > 0, dof, jnp.nan)
     else:
-        spread, dof = _coloured(Q, rss, weight.reshape(n_samples, -1), noise)
+        spread, dof = _coloured(Q, rss, scale.reshape(n_samples, -1), jnp.asarray(noise))
 
     def or_nan(value: Array) -> Array:
         return jnp.where(solvable, value, jnp.nan)
 
+    covariance = inverse @ spread @ inverse.T
     return WindowFit(
         theta=or_nan(theta),
-        covariance=or_nan(inverse @ spread @ inverse.T),
+        stderr=or_nan(jnp.sqrt(jnp.diagonal(covariance))),
+        covariance=or_nan(covariance),
         dof=or_nan(dof),
         cond=or_nan(singular[0] / singular[-1]),
         sigma_min=or_nan(singular[-1]),
         excitation=or_nan(1 / jnp.linalg.norm(inverse, axis=1)),
-        residual_rms=or_nan(jnp.sqrt(rss / n)),
+        residual_rms=or_nan(jnp.sqrt(rss / weight.sum())),
         vaf=or_nan(variance_accounted_for(y, y - W @ theta, weight)),
         samples=n.astype(int),
     )
@@ -111,9 +139,9 @@ def variance_accounted_for(
     """1 - var(residual)/var(torque) over the samples that count, means taken output by output; NaN without variance."""
 
     def scatter(x: AnyArray) -> Array:
-        count = jnp.maximum(weight.sum(axis=0), 1)
-        x = jnp.where(weight > 0, x, 0)
-        return (weight * (x - x.sum(axis=0) / count) ** 2).sum()
+        x, whole = jnp.where(weight > 0, x, 0), weight.sum(axis=0)
+        mean = (weight * x).sum(axis=0) / jnp.where(whole > 0, whole, 1)
+        return (weight * (x - mean) ** 2).sum()
 
     total = scatter(torque)
     return jnp.where(total > 0, 1 - scatter(residual) / jnp.where(total > 0, total, 1), jnp.nan)
@@ -202,12 +230,15 @@ def _inverse_of_triangle(R: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return jax.lax.fori_loop(0, p, add_row, jnp.zeros_like(R))
 
 
-def _coloured(Q: Array, rss: Array, weight: Array, noise: Array) -> tuple[Array, Array]:
-    """Covariance of `Q' y` and degrees of freedom, for noise of known covariance up to its scale."""
-    n_samples, n_outputs = weight.shape
-    p = Q.shape[1]
-    blocks = Q.reshape(n_samples, n_outputs * p)
-    shaped = (_covariance_times(noise, blocks).reshape(n_samples, n_outputs, p) * weight[..., None]).reshape(-1, p)
+def _coloured(Q: Array, rss: Array, scale: Array, noise: Array) -> tuple[Array, Array]:
+    """Covariance of `Q' y` and degrees of freedom, for noise of known covariance up to its scale.
+
+    The equations were multiplied by `scale`, and so is the noise in them.
+    """
+    n_samples, n_outputs = scale.shape
+    p, weight = Q.shape[1], scale**2
+    blocks = (Q.reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(n_samples, n_outputs * p)
+    shaped = (_covariance_times(noise, blocks).reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(-1, p)
     inner = Q.T @ shaped
     level = noise[0] if noise.ndim == 1 else jnp.diagonal(noise)[:, None]
     trace = (weight * level).sum() - jnp.trace(inner)

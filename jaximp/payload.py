@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
-from jaximp.least_squares import WindowFit, least_squares
+from jaximp.least_squares import SlidingFit, WindowFit, least_squares
 from jaximp.types import AnyArray
-from jaximp.windows import SlidingFit, sliding_least_squares
+from jaximp.windows import sliding_least_squares
 
 SAME_MOTION = 0.05
 """Method 3 needs one motion twice. The robot's own torque may differ by this share of the human's torque."""

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 from numpy.typing import NDArray
 
+from jaximp.least_squares import SlidingFit
 from jaximp.types import AnyArray, nearest
-from jaximp.windows import SlidingFit
 
 TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
 NEGATIVE = "is negative, as no mass can be"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from fractions import Fraction
 from itertools import pairwise
 from operator import itemgetter
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from jaximp import windows
 from jaximp.chunks import lags_for_sums
-from jaximp.windows import SlidingFit, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.least_squares import SlidingFit
+from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
 Numbers = NDArray[np.float64]
 
@@ -38,7 +40,7 @@ def recording(n: int, p: int = 3, outputs: tuple[int, ...] = (), seed: int = 0) 
 
 
 def assert_same(fit: SlidingFit, expected: SlidingFit, torque: Numbers, rtol: float = 1e-9) -> None:
-    for name in SlidingFit.__annotations__:
+    for name in (field.name for field in fields(SlidingFit)):
         reference = np.asarray(getattr(expected, name), float)
         atol = 1e-12 * np.nanmax(np.abs(reference), initial=0.0)
         if name == "residual_rms":  # a square root: where nothing is left, half of the digits are
@@ -92,14 +94,84 @@ def test_coloured_noise(n: int, window: int, step: int, p: int, outputs: tuple[i
         assert_same(fit, one_by_one(W, y, window, step, valid=mask, noise=noise), y)
 
 
-def test_piece_by_piece_is_the_same_to_the_last_bit() -> None:
+@pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
+@pytest.mark.parametrize("noise", [None, 0.7 ** np.arange(9)], ids=["white", "coloured"])
+def test_weights(outputs: tuple[int, ...], noise: Numbers | None) -> None:
+    W, y = recording(600, 2, outputs)
+    random = np.random.default_rng(4)
+    weights = np.where(random.random(y.shape) < 0.8, random.exponential(size=y.shape), 0.0)
+    valid = random.random(y.shape) < 0.9
+    W[~valid] = np.nan
+    fit = sliding_least_squares(W, y, 50, valid=valid, weights=weights, noise=noise)
+    assert_same(fit, one_by_one(W, y, 50, valid=valid, weights=weights, noise=noise), y)
+
+
+@pytest.mark.parametrize("noise", [None, 0.8 ** np.arange(9)], ids=["white", "coloured"])
+@pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
+def test_the_shortest_window_that_is_sure_enough(outputs: tuple[int, ...], noise: Numbers | None) -> None:
+    W, y = recording(1500, 2, outputs)
+    W[600:900] *= 0.1  # poor motion
+    y = W @ np.array([1.0, 2.0]) + 0.1 * np.random.default_rng(1).normal(size=y.shape)
+    wanted = np.array([np.inf, np.median(one_by_one(W, y, 80, noise=noise, room=300).stderr[:, 1])])
+    fit = adaptive_least_squares(W, y, wanted, 40, 300, step=10, noise=noise)
+    length = np.asarray(fit.last - fit.first) + 1
+    assert (fit.last == np.arange(39, 1500, 10)).all()
+    complete = np.asarray(fit.first) > 0  # what reaches back to the beginning is cut off there
+    lengths = np.unique(length[complete])
+    assert len(lengths) > 5
+    assert lengths[-1] == 300
+    # What each window is, and that the next shorter length is not enough.
+    found = {n: one_by_one(W, y, int(n), noise=noise, room=300) for n in lengths}
+    for m in np.flatnonzero(complete):
+        n, start = length[m], int(fit.first[m])
+        expected = jax.tree.map(itemgetter(start), found[n])
+        if np.isnan(fit.theta[m]).any():
+            assert n == 300
+            assert expected.stderr[1] > wanted[1]
+            continue
+        assert_same(jax.tree.map(itemgetter(m), fit), expected, y)
+        assert expected.stderr[1] <= wanted[1]
+        for shorter in lengths[lengths < n][-1:]:
+            assert found[shorter].stderr[start + n - shorter, 1] > wanted[1]
+
+
+def test_shortest_windows_under_jit_and_where_the_motion_changes_in_kind() -> None:
+    W, y = recording(1200, 2)
+    W[500:] = 1e-4 * W[500:] @ np.array([[1.0, 0.5], [-0.2, 1.0]])
+    y = W @ np.array([1.0, 2.0]) + 1e-5 * np.random.default_rng(1).normal(size=1200)
+    fit = adaptive_least_squares(W, y, np.array([0.1, 0.1]), 40, 100, cond=1e4)
+    assert np.isfinite(fit.theta).all()
+    inside = jax.jit(lambda W, y: adaptive_least_squares(W, y, np.array([0.1, 0.1]), 40, 100, cond=1e4))(W, y)
+    assert_same(inside, fit, y)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        pytest.param({"stderr": np.ones(3)}, "stderr has shape", id="shape"),
+        pytest.param({"stderr": np.zeros(2)}, "above zero", id="zero"),
+        pytest.param({"longest": 10}, "lengthen the longest", id="lengths"),
+        pytest.param({"shortest": 2000}, "there are only 300", id="too long"),
+        pytest.param({"noise": 0.99 ** np.arange(200)}, "decimate the rows", id="noise"),
+    ],
+)
+def test_errors_of_adaptive_windows(settings: dict[str, object], message: str) -> None:
+    W, y = recording(300, 2)
+    given = {"stderr": np.ones(2), "shortest": 20, "longest": 2000} | settings
+    with pytest.raises(ValueError, match=message):
+        adaptive_least_squares(W, y, **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("coloured", [False, True], ids=["white", "coloured"])
+def test_piece_by_piece_is_the_same_to_the_last_bit(coloured: bool) -> None:
     W, y = recording(20_000)
-    whole = sliding_least_squares(W, y, 60)
+    noise = 0.5 ** np.arange(4) if coloured else None
+    whole = sliding_least_squares(W, y, 60, noise=noise)
     borders = [0, 7, 8, 5000, 17_000, 20_000]
     pieces = ((W[a:b], y[a:b]) for a, b in pairwise(borders))
-    parts = list(sliding_pieces(pieces, 60))
+    parts = list(sliding_pieces(pieces, 60, noise=noise))
     assert len(parts) > 1
-    for name in SlidingFit.__annotations__:
+    for name in (field.name for field in fields(SlidingFit)):
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 

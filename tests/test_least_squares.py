@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ def window(
 
 
 def all_fields(fit: WindowFit) -> dict[str, Numbers]:
-    return {name: np.asarray(getattr(fit, name)) for name in (*WindowFit.__annotations__, "stderr")}
+    return {name: np.asarray(getattr(fit, name)) for name in (field.name for field in fields(WindowFit))}
 
 
 def assert_same(fit: WindowFit, other: WindowFit, rtol: float = 1e-9) -> None:
@@ -319,3 +320,30 @@ def test_gradient_through_the_fit_is_finite_difference() -> None:
 
     difference = (float(loss(step)) - float(loss(-step))) / (2 * step)
     assert float(jax.grad(loss)(0.0)) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize("coloured", [False, True], ids=["white", "coloured"])
+def test_weights_are_a_row_multiplied(coloured: bool) -> None:
+    W, y = window(40, 3)
+    random = np.random.default_rng(2)
+    weights = np.where(random.random(40) < 0.8, random.exponential(size=40), 0.0)
+    root, kept = np.sqrt(weights), weights > 0
+    covariance = toeplitz(0.6 ** np.arange(40))
+    fit = least_squares(W, y, weights=weights, noise=covariance if coloured else None)
+    rows, torque = W * root[:, None], y * root
+    inverse = np.linalg.pinv(rows)
+    residual = torque - rows @ inverse @ torque
+    spread, dof = np.eye(40), kept.sum() - 3.0
+    variance = residual @ residual / dof
+    if coloured:
+        spread = root[:, None] * covariance * root
+        left = (np.eye(40) - rows @ inverse) @ spread
+        variance, dof = residual @ residual / np.trace(left), np.trace(left) ** 2 / np.trace(left @ left)
+    np.testing.assert_allclose(fit.theta, inverse @ torque, rtol=1e-9)
+    np.testing.assert_allclose(fit.covariance, inverse @ spread @ inverse.T * variance, rtol=1e-8)
+    assert float(fit.dof) == pytest.approx(dof)
+    assert float(fit.residual_rms) == pytest.approx(np.sqrt(residual @ residual / weights.sum()))
+    plain = y - W @ np.asarray(fit.theta)
+    scatter = [(weights * (x - (weights @ x) / weights.sum()) ** 2).sum() for x in (plain, y)]
+    assert float(fit.vaf) == pytest.approx(1 - scatter[0] / scatter[1])
+    assert int(fit.samples) == kept.sum()

@@ -188,6 +188,7 @@ def sliding(*windows: Window) -> SlidingFit:
         residual_rms=0.1 * vaf,
         vaf=vaf,
         samples=samples,
+        first=jnp.arange(len(windows)),
         last=jnp.arange(len(windows)),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.least_squares import WindowFit, least_squares
-from jaximp.windows import SlidingFit, score, sliding_least_squares, window_starts
+from jaximp.least_squares import Fit, SlidingFit, WindowFit, least_squares
+from jaximp.windows import score, sliding_least_squares, sliding_theta, window_starts
 
 Numbers = NDArray[np.float64]
 THETA = np.array([0.1, 1.5, 20.0])
@@ -40,12 +41,13 @@ def assert_windows_are_slices(
     for m, start in enumerate(starts):
         cut = slice(start, start + window)
         expected = fit_of(W[cut], y[cut], valid[cut], noise)
-        assert int(fit.last[m]) == start + window - 1
-        for name in SlidingFit.__annotations__:
-            if name != "last":
-                reference = np.asarray(getattr(expected, name))
-                atol = 1e-12 * np.abs(np.nan_to_num(reference)).max()
-                np.testing.assert_allclose(getattr(fit, name)[m], reference, 1e-9, atol, err_msg=f"{name} of {m}")
+        assert (int(fit.first[m]), int(fit.last[m])) == (start, start + window - 1)
+        for field in fields(Fit):
+            reference = np.asarray(getattr(expected, field.name))
+            atol = 1e-12 * np.abs(np.nan_to_num(reference)).max()
+            np.testing.assert_allclose(
+                getattr(fit, field.name)[m], reference, 1e-9, atol, err_msg=f"{field.name} of {m}"
+            )
 
 
 @pytest.mark.parametrize(
@@ -170,6 +172,26 @@ def test_a_mask_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
         sliding_least_squares(*recording(), 20, valid=np.ones(shape, bool))
 
 
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
+def test_weights_that_make_no_sense_are_refused(bad: float) -> None:
+    weights = np.ones(300)
+    weights[7] = bad
+    with pytest.raises(ValueError, match="finite and not negative"):
+        sliding_least_squares(*recording(), 20, weights=weights)
+    with pytest.raises(ValueError, match="weights has shape"):
+        sliding_least_squares(*recording(), 20, weights=weights[:9])
+
+
+def test_lengths_in_seconds() -> None:
+    W, y = recording()
+    expected, fit = sliding_least_squares(W, y, 20, 5), sliding_least_squares(W, y, 0.2, 0.05, sample_rate=100.0)
+    for field in fields(SlidingFit):
+        np.testing.assert_array_equal(getattr(fit, field.name), getattr(expected, field.name))
+    np.testing.assert_array_equal(sliding_theta(W, y, 0.2, sample_rate=100.0), sliding_least_squares(W, y, 20).theta)
+    with pytest.raises(ValueError, match=r"window is 0\.002 s, less than one sample at 100 Hz"):
+        sliding_least_squares(W, y, 0.002, sample_rate=100.0)
+
+
 def test_window_starts() -> None:
     assert window_starts(10, 4, 3).tolist() == [0, 3, 6]
     assert window_starts(10, 10, 3).tolist() == [0]
@@ -187,7 +209,7 @@ def test_vmap_over_recordings_is_a_loop() -> None:
     batch = jax.vmap(lambda W, y: sliding_least_squares(W, y, 20, 9))(W, y)
     for k in range(3):
         one = sliding_least_squares(W[k], y[k], 20, 9)
-        for name in SlidingFit.__annotations__:
+        for name in (field.name for field in fields(SlidingFit)):
             np.testing.assert_allclose(getattr(batch, name)[k], getattr(one, name), rtol=1e-9, err_msg=name)
 
 
