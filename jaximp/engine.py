@@ -45,8 +45,8 @@ BLOCK = 16
 """Rows in a block, at least."""
 DOUBT = 1e-2
 """A pivot below this share of its column leaves the window's estimate to a QR decomposition."""
-WELL_CONDITIONED = 1e-8
-"""Ratio of a Gram matrix's eigenvalues down to which the smaller is accurate enough."""
+WELL_CONDITIONED = 4e7
+"""Ratio of a Gram matrix's eigenvalues, in units of rounding, down to which the smaller is accurate enough."""
 MOST_ITERATIONS = 40
 """Of Laguerre's method: it converges cubically, but where two eigenvalues nearly coincide."""
 
@@ -578,7 +578,7 @@ def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array
     The smallest of these drowns in rounding where the matrix is ill conditioned; if any is, it is found as the largest
     of the inverse, which does not.
     """
-    p = len(given)
+    p, rounding = len(given), jnp.finfo(given.dtype).eps
 
     def gram() -> Array:
         return jnp.stack([_total(given[k, i] * given[k] for k in range(i + 1)) for i in range(p)])
@@ -588,7 +588,7 @@ def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array
 
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
         count, largest, smallest = state
-        return (count == 0) | ((count == 1) & (smallest < WELL_CONDITIONED * largest).any())
+        return (count == 0) | ((count == 1) & (smallest < WELL_CONDITIONED * rounding * largest).any())
 
     def find(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, largest, _ = state
