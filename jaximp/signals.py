@@ -1,17 +1,18 @@
-"""Filters and derivatives of sampled signals, differentiable and vmappable; time is axis 0.
+"""Filters and derivatives of sampled signals; time is axis 0.
 
-scipy designs the filters. Applying them is written here in JAX, with scipy's edge treatment, because a fit that is
-filtered inside every window, and a gradient through a filter, need it.
+scipy designs the filters. Applying them is written here in JAX, with scipy's edge treatment, differentiable and
+vmappable. Only what prepares a filter for many windows (`filter_in_windows`, `zero_phase_matrix`) is numpy.
 """
 
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float, Integer, Num
 from numpy.typing import NDArray
 
 from jaximp.types import AnyArray
@@ -56,12 +57,7 @@ def filter_zero_phase(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "
     """
     require_float64(x)
     x, sos = _floating(x), np.asarray(sos, np.float64)
-    edge = edge_samples(sos)
-    if x.shape[0] <= edge:
-        raise ValueError(
-            f"{x.shape[0]} samples are too few for this filter, which needs more than {edge}: "
-            "use a longer window or recording, or a lower order"
-        )
+    edge = _edge_within(sos, x.shape[0])
     start, end = 2 * x[:1] - x[edge:0:-1], 2 * x[-1:] - x[-2 : -edge - 2 : -1]
     y = _filter_from_rest(sos, jnp.concatenate([start, x, end]))
     return _filter_from_rest(sos, y, backward=True)[edge:-edge]
@@ -76,6 +72,17 @@ def edge_samples(sos: NDArray[np.float64]) -> int:
     """How many samples scipy extends a signal by at each end."""
     taps = 2 * len(sos) + 1 - min(int((sos[:, 2] == 0).sum()), int((sos[:, 5] == 0).sum()))
     return 3 * taps
+
+
+def _edge_within(sos: NDArray[np.float64], n: int) -> int:
+    """`edge_samples`, of which n samples must be able to make an extension."""
+    edge = edge_samples(sos)
+    if n <= edge:
+        raise ValueError(
+            f"{n} samples are too few for this filter, which needs more than {edge}: "
+            "use a longer window or recording, or a lower order"
+        )
+    return edge
 
 
 def _filter_from_rest(sos: NDArray[np.float64], x: Array, backward: bool = False) -> Array:
@@ -102,6 +109,99 @@ def _filter(sos: Array, rest: Array, x: Array, backward: bool) -> Array:
 
     first = x[-1] if backward else x[0]
     return jax.lax.scan(step, [(z1 * first, z2 * first) for z1, z2 in rest], x, reverse=backward)[1]
+
+
+class FilteredWindows(NamedTuple):
+    """Windows that were filtered each by itself: `whole[start : start + S] + amounts[k] @ shapes` is window k."""
+
+    starts: NDArray[np.int64]
+    """(M,) first sample of each window."""
+    whole: NDArray[np.float64]
+    """(N, *n) the recording, filtered in one go."""
+    shapes: NDArray[np.float64]
+    """(r, S) what the ends of a window can add to that: r = 4k shapes for a filter of k second-order sections."""
+    amounts: NDArray[np.float64]
+    """(M, *n, r) how much of each shape every window has."""
+
+    def at(self, samples: NDArray[np.int64]) -> NDArray[np.float64]:
+        """These samples (L,), counted from a window's start, of every window: (M, L, *n)."""
+        added = np.moveaxis(self.amounts @ self.shapes[:, samples], -1, 1)
+        return self.whole[self.starts[:, None] + samples] + added
+
+
+def filter_in_windows(
+    sos: Sections | None, x: Num[AnyArray, "N *n"], starts: Integer[AnyArray, " M"], window: int
+) -> FilteredWindows:
+    """`filter_zero_phase` of every window of `window` samples by itself, for little more than the price of one pass.
+
+    All that a filter knows of the past is its state. So a window differs from the recording, filtered in one go, only
+    by what the filter does if left to itself, after it came into the window in another state: forward at the window's
+    start, backward at its end. These states come from the extensions, filtered for all windows at a time.
+
+    **Arguments:** `sos` None leaves the windows as they are.
+
+    **Raises:** `ValueError` if a window has too few samples for the extension.
+    """
+    from scipy.signal import sosfilt
+
+    require_float64(x)
+    x, starts = np.asarray(x, np.float64), np.asarray(starts)
+    if sos is None:
+        return FilteredWindows(starts, x, np.zeros((0, window)), np.zeros((len(starts), *x.shape[1:], 0)))
+    sos, ends = np.asarray(sos, np.float64), starts + window
+    near = np.arange(_edge_within(sos, window) + 1)[:, None]
+    forward, forward_states = _pass_with_states(sos, x)
+    backward, backward_states = _pass_with_states(sos, forward[::-1])
+    n_states = 2 * len(sos)
+    every_state = np.eye(n_states).reshape(len(sos), 2, n_states)
+    free, left = sosfilt(sos, np.zeros((window, n_states)), axis=0, zi=every_state)
+    shapes = np.concatenate([sosfilt(sos, free[::-1], axis=0)[::-1], free[::-1]], axis=1)
+
+    def flat(states: NDArray[np.float64]) -> NDArray[np.float64]:
+        return states.reshape(n_states, *states.shape[2:])
+
+    first = x[starts + near]  # (edge + 1, M, *n), from the start of every window on
+    before = 2 * first[0] - first[:0:-1]
+    entering = flat(sosfilt(sos, before, axis=0, zi=_rest(sos, before[0]))[1] - forward_states[:, :, starts])
+    last = x[ends - 1 - near]  # from its end backwards
+    leaving = forward_states[:, :, ends] + np.tensordot(left, entering, 1)
+    after = sosfilt(sos, 2 * last[0] - last[1:], axis=0, zi=leaving)[0][::-1]
+    returning = flat(sosfilt(sos, after, axis=0, zi=_rest(sos, after[0]))[1] - backward_states[:, :, len(x) - ends])
+    amounts = np.moveaxis(np.concatenate([entering, returning]), 0, -1)
+    return FilteredWindows(starts, backward[::-1], shapes.T, amounts)
+
+
+def _rest(sos: NDArray[np.float64], x: AnyArray) -> NDArray[np.float64]:
+    """States (k, 2, ...) as if the sample x (...) had lasted for ever."""
+    from scipy.signal import sosfilt_zi
+
+    return np.multiply.outer(sosfilt_zi(sos), x)
+
+
+def _pass_with_states(
+    sos: NDArray[np.float64], x: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """One pass from rest over x (N, ...), and the states (k, 2, N + 1, ...) before every sample and after the last."""
+    from scipy.signal import sosfilt
+
+    states = np.repeat(_rest(sos, x[0])[:, :, None], len(x) + 1, axis=2)
+    for section, (z1, z2) in zip(sos, states, strict=True):
+        _, b1, b2, _, a1, a2 = section
+        y = sosfilt(section[None], x, axis=0, zi=np.stack([z1[0], z2[0]])[None])[0]
+        z2[1:] = b2 * x - a2 * y
+        z1[1:] = b1 * x - a1 * y + z2[:-1]
+        x = y
+    return x, states
+
+
+def zero_phase_matrix(sos: Sections, n: int, every: int = 1) -> NDArray[np.float64]:
+    """The matrix (ceil(n / every), n) that filters n samples to zero phase and keeps every `every`-th of them.
+
+    **Raises:** `ValueError` if n samples are too few for the extension.
+    """
+    # Its columns are impulses, filtered: the windows that slide over a single one.
+    impulse = np.eye(1, 2 * n - 1, n - 1)[0]
+    return filter_in_windows(sos, impulse, np.arange(n)[::-1], n).at(np.arange(0, n, every)).T
 
 
 def central_differences(

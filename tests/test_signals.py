@@ -18,12 +18,14 @@ from jaximp.signals import (
     butterworth,
     central_differences,
     fill_gaps,
+    filter_in_windows,
     filter_zero_phase,
     noise_level,
     quantisation_step,
     reach,
     require_float64,
     widen_gaps,
+    zero_phase_matrix,
 )
 
 RATE = 1000.0
@@ -75,6 +77,37 @@ def test_whole_numbers_are_filtered_like_scipy_or_refused(sos: NDArray[np.float6
     except (ValueError, TypeError):
         return
     np.testing.assert_allclose(filtered, sosfiltfilt(sos, counts), rtol=1e-9, atol=1e-7)
+
+
+@pytest.mark.parametrize("sos", FILTERS)
+@pytest.mark.parametrize(
+    ("shape", "window", "step"),
+    [((700,), 300, 1), ((700, 2), 300, 37), ((700,), 28, 11), ((700,), 700, 1), ((700, 2), 60, 90)],
+    ids=["sliding", "two joints", "short windows", "all of it", "windows apart"],
+)
+def test_filtering_in_windows_is_scipys_in_each(
+    sos: NDArray[np.float64], shape: tuple[int, ...], window: int, step: int
+) -> None:
+    x = 3 + noise(shape).cumsum(axis=0)
+    starts = np.arange(0, shape[0] - window + 1, step)
+    found = filter_in_windows(sos, x, starts, window).at(np.arange(window))
+    expected = np.stack([sosfiltfilt(sos, x[start : start + window], axis=0) for start in starts])
+    assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
+
+
+def test_windows_without_a_filter_stay_as_they_are() -> None:
+    x, starts = noise((50, 2)), np.array([0, 7, 30])
+    every_other = np.arange(0, 20, 2)
+    found = filter_in_windows(None, x, starts, 20).at(every_other)
+    np.testing.assert_array_equal(found, np.stack([x[start : start + 20 : 2] for start in starts]))
+
+
+@pytest.mark.parametrize("sos", FILTERS)
+@pytest.mark.parametrize(("n", "every"), [(28, 1), (400, 7)])
+def test_the_matrix_of_a_filter_is_what_scipy_makes_of_impulses(sos: NDArray[np.float64], n: int, every: int) -> None:
+    np.testing.assert_allclose(
+        zero_phase_matrix(sos, n, every), sosfiltfilt(sos, np.eye(n), axis=0)[::every], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("sos", FILTERS[::3])
