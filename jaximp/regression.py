@@ -6,22 +6,30 @@ writes, inside every window, whose rows then stand one block after another.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
+from jaximp.chunks import _cores
 from jaximp.job import FilterSettings, Job
 from jaximp.models import Model
 from jaximp.types import AnyArray, Recording
-from jaximp.windows import map_windows, slice_window, window_starts
+from jaximp.windows import slice_window, window_starts
 
 LARGEST_BLOCKS = 200_000_000
 """Numbers that filtering inside every window may keep (1.6 GB)."""
+CACHED_NUMBERS = 64_000
+"""Samples of windows that are filtered at a time: all their columns fit into the cache."""
+MOST_BATCHES = 64
+"""So many times, in a part that one core works on."""
 
 
 @dataclass(frozen=True)
@@ -164,40 +172,106 @@ def _regress_in_windows(
     """The paper's letter: every window is filtered by itself. The windows' rows stand one block after another."""
     rate = recording.sample_rate
     window = round(job.window.length * rate)
-    starts = window_starts(len(recording), window, round(step_seconds(job) * rate))
-    n_rows = len(range(0, window, filters.decimate))
-    if len(starts) * n_rows * len(model.names) > LARGEST_BLOCKS:
+    step = round(step_seconds(job) * rate)
+    starts = window_starts(len(recording), window, step)
+    kept = np.arange(0, window, filters.decimate)
+    if len(starts) * len(kept) * recording.n_joints * len(model.names) > LARGEST_BLOCKS:
         raise ValueError(
             "filtering inside every window makes too many rows here: lengthen window.step or filter.decimate"
         )
-
-    W, y, speed = _filtered_windows(model, filters, rate, window, jnp.asarray(starts), q, torque)
-    kept = np.arange(0, window, filters.decimate)
     inside = _away_from_ends(window, filters, job.filter)
     if inside.sum() * recording.n_joints < len(model.names):
         raise ValueError(
             f"windows of {job.window.length:g} s are shorter than the filters' transients at both ends "
             f"({2 * filters.reach / rate:.2g} s): lengthen them, or set filter.drop_transient = false"
         )
+
+    if recording.n_joints == 1:
+        q, torque = q[:, 0], torque[:, 0]
+    smooth = signals.filter_in_windows(filters.position, q, starts, window)
+    W, speed = _columns_of_windows(model, filters, rate, smooth, step)
+    y = signals.filter_in_windows(filters.parallel, torque, starts, window).at(kept)
     index = starts[:, None] + kept
-    valid = undisturbed(recording, filters, ends=False)[index] & inside
-    moving = np.asarray(speed) >= job.window.min_velocity
-    valid = valid & moving if recording.n_joints == 1 else valid[..., None] & moving
+    counts = undisturbed(recording, filters, ends=False)[index] & inside
+    valid = counts.reshape(*counts.shape, *(1,) * (y.ndim - 2)) & (speed >= job.window.min_velocity)
     W, y = (x.reshape(-1, *x.shape[2:]) for x in (W, y))
-    return Rows(W, y, valid.reshape(-1, *valid.shape[2:]), recording.time[index].ravel())
+    return Rows(jnp.asarray(W), jnp.asarray(y), valid.reshape(y.shape), recording.time[index].ravel())
+
+
+@lru_cache(maxsize=1)
+def _response(filters: Filters, window: int) -> Array | None:
+    """The matrix (rows, S) that takes a window's samples through the parallel filter to the rows that are kept.
+
+    All columns of all recordings pass it, and the noise.
+    """
+    if filters.parallel is None:
+        return None
+    if len(range(0, window, filters.decimate)) * window > LARGEST_BLOCKS:
+        raise ValueError(
+            f"windows of {window} samples are too long to be filtered one by one: shorten window.length, or set "
+            "filter.mode = 'once'"
+        )
+    return jnp.asarray(signals.zero_phase_matrix(filters.parallel, window, filters.decimate))
+
+
+def _columns_of_windows(
+    model: Model, filters: Filters, sample_rate: float, smooth: signals.FilteredWindows, step: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Regressor (M, rows, *n, p) and speed (M, rows, *n) of windows that begin every `step` samples.
+
+    All cores work on parts of one size: recordings of any length share the compiled code.
+    """
+    n_windows, window = len(smooth.amounts), smooth.shapes.shape[1]
+    at_a_time = max(1, min(n_windows, CACHED_NUMBERS // (window * model.n_joints)))
+    per_part = at_a_time * min(MOST_BATCHES, -(-n_windows // (at_a_time * _cores())))
+    behind = -n_windows % per_part
+    whole, amounts = _zeros_behind(smooth.whole, behind * step), _zeros_behind(smooth.amounts, behind)
+    shapes, response = jnp.asarray(smooth.shapes), _response(filters, window)
+    kept = (n_windows, len(range(0, window, filters.decimate)), *smooth.whole.shape[1:])
+    W, speed = np.empty((*kept, len(model.names))), np.empty(kept)
+
+    def put(first: int) -> None:
+        part = slice(first, first + per_part)
+        samples = whole[first * step :][: (per_part - 1) * step + window]
+        made = _columns(model, sample_rate, filters.decimate, step, at_a_time, samples, shapes, amounts[part], response)
+        W[part], speed[part] = (x[: n_windows - first] for x in made)
+
+    with ThreadPoolExecutor(_cores()) as pool:
+        list(pool.map(put, range(0, n_windows, per_part)))
+    return W, speed
+
+
+def _zeros_behind(x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    return np.concatenate([x, np.zeros((n, *x.shape[1:]))])
 
 
 @eqx.filter_jit
-def _filtered_windows(
-    model: Model, filters: Filters, sample_rate: float, window: int, starts: Array, q: AnyArray, torque: AnyArray
-) -> tuple[Array, Array, Array]:
-    """`_filtered` of every window, (M, rows, ...)."""
+def _columns(
+    model: Model,
+    sample_rate: float,
+    decimate: int,
+    step: int,
+    at_a_time: int,
+    whole: AnyArray,
+    shapes: Array,
+    amounts: AnyArray,
+    response: Array | None,
+) -> tuple[Array, Array]:
+    """Regressor and speed of some windows, see `signals.FilteredWindows`; `at_a_time` fit into the cache."""
 
-    def one(start: Array) -> tuple[Array, Array, Array]:
-        q_window, torque_window = slice_window((jnp.asarray(q), jnp.asarray(torque)), start, window)
-        return _filtered(model, filters, sample_rate, q_window, torque_window)
+    def one(start: Array, amount: Array) -> tuple[Array, Array]:
+        (samples,) = slice_window((whole,), start, shapes.shape[1])
+        q = samples + (amount @ shapes).T
+        dq, ddq = signals.central_differences(q, sample_rate)
+        W = model.observation_matrix(q, dq, ddq)
+        if response is None:
+            return W[::decimate], jnp.abs(dq[::decimate])
+        # Column by column, as they come out of the model: side by side they would first be copied.
+        columns = [response @ W[..., k] for k in range(W.shape[-1])]
+        return jnp.stack(columns, axis=-1), jnp.abs(dq[::decimate])
 
-    return map_windows(one, starts, window * len(model.names))
+    starts = jnp.arange(len(amounts)) * step
+    return jax.lax.map(lambda window: one(*window), (starts, amounts), batch_size=at_a_time)
 
 
 def _away_from_ends(window: int, filters: Filters, settings: FilterSettings) -> NDArray[np.bool_]:
@@ -285,12 +359,8 @@ def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | N
     if job.filter.mode == "once" or filters.parallel is None:
         return None if filters.noise is None else jnp.asarray(filters.noise)
     window = round(job.window.length * recording.sample_rate)
-    if window**2 > LARGEST_BLOCKS:
-        raise ValueError(
-            f"windows of {window} samples are too long to be filtered one by one: shorten window.length, or set "
-            "filter.mode = 'once'"
-        )
-    response = signals.filter_zero_phase(filters.parallel, jnp.eye(window))[:: filters.decimate]
+    response = _response(filters, window)
+    assert response is not None
     return response @ response.T
 
 
