@@ -292,7 +292,9 @@ def _prepare_pair(
     once = replace(job, filter=replace(job.filter, mode="once"))
     whole = regress_both(robot, human, alone, once, filters)[0]
     robot_fit = fit_robot(whole, noise_of_rows(once, alone, filters))
-    in_windows = whole if job.filter.mode == "once" else regress_both(robot, human, alone, job, filters)[0]
+    # Methods 1 and 2 need no windows of the robot alone.
+    shared = job.filter.mode == "once" or not {3, 4}.intersection(job.model.methods)
+    in_windows = whole if shared else regress_both(robot, human, alone, job, filters)[0]
     loaded, rows = regress_both(robot, human, recording, job, filters)
     return rows, _Pair(robot, robot_fit, in_windows, loaded)
 

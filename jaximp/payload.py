@@ -7,12 +7,12 @@ regressions: rows of the robot's and the human's model, and the motor's torque.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.least_squares import SlidingFit, WindowFit, least_squares
@@ -56,7 +56,8 @@ class Separation(eqx.Module):
 
 def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None) -> WindowFit:
     """Parameters of the robot from the whole recording R, as methods 1 and 2 begin."""
-    fit = least_squares(alone.robot, alone.torque, alone.valid, noise)
+    # Compiled in one piece: every operation for itself takes many times as long to compile.
+    fit = jax.jit(least_squares)(alone.robot, alone.torque, alone.valid, noise)
     if not bool(jnp.isfinite(fit.theta).all()):
         raise ValueError(
             "the recording of the robot alone does not determine the robot's parameters: "
@@ -84,7 +85,7 @@ def separate(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: the paper has methods 1, 2, 3 and 4")
-    slide = partial(sliding_least_squares, window=window, step=step, noise=noise, room=room)
+    slide = Partial(sliding_least_squares, window=window, step=step, noise=noise, room=room)
     torque = loaded.torque - loaded.robot @ robot.theta
     if method == 1:
         fit = _robot_first(robot, loaded, torque, slide)
@@ -107,13 +108,19 @@ def separate(
 def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: Callable[..., SlidingFit]) -> SlidingFit:
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
     fit = slide(loaded.human, torque, valid=loaded.valid)
-
-    def response(column: Array) -> Array:
-        return slide(loaded.human, column, valid=loaded.valid).theta
-
-    passed_on = jax.lax.map(response, loaded.robot.T)  # (r, M, h)
+    passed_on = _explained_by_the_human(slide, loaded)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
     return _with_inherited_variance(fit, inherited, robot.dof)
+
+
+@eqx.filter_jit
+def _explained_by_the_human(slide: Callable[..., SlidingFit], loaded: Regression) -> Array:
+    """The human's parameters that imitate each of the robot's columns, (r, M, h); the noise has no part in them."""
+
+    def response(column: Array) -> Array:
+        return slide(loaded.human, column, valid=loaded.valid, noise=None).theta
+
+    return jax.lax.map(response, loaded.robot.T)
 
 
 def _difference_of_parameters(
