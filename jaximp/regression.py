@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.chunks import _cores
 from jaximp.job import FilterSettings, Job
-from jaximp.models import Model
+from jaximp.models import MOTION, Model
 from jaximp.types import AnyArray, Recording
 from jaximp.windows import slice_window, window_starts
 
@@ -188,14 +188,44 @@ def _regress_in_windows(
 
     if recording.n_joints == 1:
         q, torque = q[:, 0], torque[:, 0]
-    smooth = signals.filter_in_windows(filters.position, q, starts, window)
-    W, speed = _columns_of_windows(model, filters, rate, smooth, step)
-    y = signals.filter_in_windows(filters.parallel, torque, starts, window).at(kept)
+    W, y, speed = _rows_of_windows(model, filters, rate, *(signals.cut_signal(x, starts, window) for x in (q, torque)))
     index = starts[:, None] + kept
     counts = undisturbed(recording, filters, ends=False)[index] & inside
     valid = counts.reshape(*counts.shape, *(1,) * (y.ndim - 2)) & (speed >= job.window.min_velocity)
     W, y = (x.reshape(-1, *x.shape[2:]) for x in (W, y))
     return Rows(jnp.asarray(W), jnp.asarray(y), valid.reshape(y.shape), recording.time[index].ravel())
+
+
+def _rows_of_windows(
+    model: Model, filters: Filters, sample_rate: float, q: signals.CutSignal, torque: signals.CutSignal
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Regressor (M, rows, *n, p), torque and speed (M, rows, *n) of all windows."""
+    if filters.position is not None:
+        q = signals.filter_in_windows(filters.position, q)
+    dq, ddq = signals.differences_in_windows(q, sample_rate)
+    speed = np.abs(dq.at(np.arange(0, q.shapes.shape[1], filters.decimate)))
+    one = signals.cut_signal(np.ones_like(q.whole), q.starts, q.shapes.shape[1])
+    motion = dict(zip(MOTION, (q, dq, ddq, one), strict=True)) if model.n_joints == 1 else {}
+    others = tuple(k for k, column in enumerate(model.columns) if column not in motion)
+    W = np.empty((*speed.shape, len(model.names)))
+
+    with ThreadPoolExecutor(1) as beside:
+        made = beside.submit(_other_columns, model, others, filters, sample_rate, q) if others else None
+        for column in motion.keys() & model.columns:
+            rows = _filtered_rows(filters, motion[column])
+            for k in np.flatnonzero(np.array(model.columns) == column):
+                W[..., k] = rows
+        y = _filtered_rows(filters, torque)
+        if made is not None:
+            W[..., others] = made.result()
+    return W, y, speed
+
+
+def _filtered_rows(filters: Filters, signal: signals.CutSignal) -> NDArray[np.float64]:
+    """The rows of every window that are kept, after the parallel filter: (M, rows, *n)."""
+    if filters.parallel is not None:
+        signal = signals.filter_in_windows(filters.parallel, signal)
+    return signal.at(np.arange(0, signal.shapes.shape[1], filters.decimate))
 
 
 @lru_cache(maxsize=1)
@@ -214,31 +244,32 @@ def _response(filters: Filters, window: int) -> Array | None:
     return jnp.asarray(signals.zero_phase_matrix(filters.parallel, window, filters.decimate))
 
 
-def _columns_of_windows(
-    model: Model, filters: Filters, sample_rate: float, smooth: signals.FilteredWindows, step: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Regressor (M, rows, *n, p) and speed (M, rows, *n) of windows that begin every `step` samples.
+def _other_columns(
+    model: Model, chosen: tuple[int, ...], filters: Filters, sample_rate: float, q: signals.CutSignal
+) -> NDArray[np.float64]:
+    """The chosen columns, which are not linear in the motion: made and filtered in every window, (M, rows, *n, k).
 
     All cores work on parts of one size: recordings of any length share the compiled code.
     """
-    n_windows, window = len(smooth.amounts), smooth.shapes.shape[1]
+    n_windows, window = len(q.starts), q.shapes.shape[1]
+    step = int(q.starts[1]) if n_windows > 1 else 1
     at_a_time = max(1, min(n_windows, CACHED_NUMBERS // (window * model.n_joints)))
     per_part = at_a_time * min(MOST_BATCHES, -(-n_windows // (at_a_time * _cores())))
     behind = -n_windows % per_part
-    whole, amounts = _zeros_behind(smooth.whole, behind * step), _zeros_behind(smooth.amounts, behind)
-    shapes, response = jnp.asarray(smooth.shapes), _response(filters, window)
-    kept = (n_windows, len(range(0, window, filters.decimate)), *smooth.whole.shape[1:])
-    W, speed = np.empty((*kept, len(model.names))), np.empty(kept)
+    whole, amounts = _zeros_behind(q.whole, behind * step), _zeros_behind(q.amounts, behind)
+    shapes, response = jnp.asarray(q.shapes), _response(filters, window)
+
+    found = np.empty((n_windows, len(range(0, window, filters.decimate)), *q.whole.shape[1:], len(chosen)))
 
     def put(first: int) -> None:
         part = slice(first, first + per_part)
         samples = whole[first * step :][: (per_part - 1) * step + window]
-        made = _columns(model, sample_rate, filters.decimate, step, at_a_time, samples, shapes, amounts[part], response)
-        W[part], speed[part] = (x[: n_windows - first] for x in made)
+        sizes = (sample_rate, filters.decimate, step, at_a_time)
+        found[part] = _columns(model, chosen, *sizes, samples, shapes, amounts[part], response)[: n_windows - first]
 
     with ThreadPoolExecutor(_cores()) as pool:
         list(pool.map(put, range(0, n_windows, per_part)))
-    return W, speed
+    return found
 
 
 def _zeros_behind(x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
@@ -248,6 +279,7 @@ def _zeros_behind(x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
 @eqx.filter_jit
 def _columns(
     model: Model,
+    chosen: tuple[int, ...],
     sample_rate: float,
     decimate: int,
     step: int,
@@ -256,19 +288,17 @@ def _columns(
     shapes: Array,
     amounts: AnyArray,
     response: Array | None,
-) -> tuple[Array, Array]:
-    """Regressor and speed of some windows, see `signals.FilteredWindows`; `at_a_time` fit into the cache."""
+) -> Array:
+    """The chosen columns of some windows that begin every `step` samples; `at_a_time` fit into the cache."""
 
-    def one(start: Array, amount: Array) -> tuple[Array, Array]:
+    def one(start: Array, amount: Array) -> Array:
         (samples,) = slice_window((whole,), start, shapes.shape[1])
         q = samples + (amount @ shapes).T
-        dq, ddq = signals.central_differences(q, sample_rate)
-        W = model.observation_matrix(q, dq, ddq)
+        W = model.observation_matrix(q, *signals.central_differences(q, sample_rate))
         if response is None:
-            return W[::decimate], jnp.abs(dq[::decimate])
+            return W[::decimate, ..., jnp.array(chosen)]
         # Column by column, as they come out of the model: side by side they would first be copied.
-        columns = [response @ W[..., k] for k in range(W.shape[-1])]
-        return jnp.stack(columns, axis=-1), jnp.abs(dq[::decimate])
+        return jnp.stack([response @ W[..., k] for k in chosen], axis=-1)
 
     starts = jnp.arange(len(amounts)) * step
     return jax.lax.map(lambda window: one(*window), (starts, amounts), batch_size=at_a_time)

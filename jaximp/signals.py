@@ -1,7 +1,7 @@
 """Filters and derivatives of sampled signals; time is axis 0.
 
 scipy designs the filters. Applying them is written here in JAX, with scipy's edge treatment, differentiable and
-vmappable. Only what prepares a filter for many windows (`filter_in_windows`, `zero_phase_matrix`) is numpy.
+vmappable. What many windows of one recording share (`CutSignal`) is worked out in numpy.
 """
 
 from __future__ import annotations
@@ -111,15 +111,19 @@ def _filter(sos: Array, rest: Array, x: Array, backward: bool) -> Array:
     return jax.lax.scan(step, [(z1 * first, z2 * first) for z1, z2 in rest], x, reverse=backward)[1]
 
 
-class FilteredWindows(NamedTuple):
-    """Windows that were filtered each by itself: `whole[start : start + S] + amounts[k] @ shapes` is window k."""
+class CutSignal(NamedTuple):
+    """A signal that every window has a version of its own of: in window k `whole[start:][:S] + amounts[k] @ shapes`.
+
+    What is linear, and done inside every window, makes another `CutSignal` of it: it is done once to the recording and
+    once to each shape, and what it does differently at the ends of a window becomes another few shapes.
+    """
 
     starts: NDArray[np.int64]
     """(M,) first sample of each window."""
     whole: NDArray[np.float64]
-    """(N, *n) the recording, filtered in one go."""
+    """(N, *n) what all windows share, where they overlap."""
     shapes: NDArray[np.float64]
-    """(r, S) what the ends of a window can add to that: r = 4k shapes for a filter of k second-order sections."""
+    """(r, S) what windows of S samples differ by."""
     amounts: NDArray[np.float64]
     """(M, *n, r) how much of each shape every window has."""
 
@@ -129,33 +133,34 @@ class FilteredWindows(NamedTuple):
         return self.whole[self.starts[:, None] + samples] + added
 
 
-def filter_in_windows(
-    sos: Sections | None, x: Num[AnyArray, "N *n"], starts: Integer[AnyArray, " M"], window: int
-) -> FilteredWindows:
-    """`filter_zero_phase` of every window of `window` samples by itself, for little more than the price of one pass.
+def cut_signal(x: Num[AnyArray, "N *n"], starts: Integer[AnyArray, " M"], window: int) -> CutSignal:
+    """The windows of `window` samples, as they are in the recording."""
+    require_float64(x)
+    x = np.asarray(x, np.float64)
+    return CutSignal(np.asarray(starts), x, np.zeros((0, window)), np.zeros((len(starts), *x.shape[1:], 0)))
+
+
+def filter_in_windows(sos: Sections, signal: CutSignal) -> CutSignal:
+    """`filter_zero_phase` of every window by itself, for little more than the price of one pass over the recording.
 
     All that a filter knows of the past is its state. So a window differs from the recording, filtered in one go, only
     by what the filter does if left to itself, after it came into the window in another state: forward at the window's
     start, backward at its end. These states come from the extensions, filtered for all windows at a time.
 
-    **Arguments:** `sos` None leaves the windows as they are.
-
     **Raises:** `ValueError` if a window has too few samples for the extension.
     """
-    from scipy.signal import sosfilt
+    from scipy.signal import sosfilt, sosfiltfilt
 
-    require_float64(x)
-    x, starts = np.asarray(x, np.float64), np.asarray(starts)
-    if sos is None:
-        return FilteredWindows(starts, x, np.zeros((0, window)), np.zeros((len(starts), *x.shape[1:], 0)))
-    sos, ends = np.asarray(sos, np.float64), starts + window
+    starts, x, shapes, amounts = signal
+    sos, window, ends = np.asarray(sos, np.float64), shapes.shape[1], starts + shapes.shape[1]
     near = np.arange(_edge_within(sos, window) + 1)[:, None]
     forward, forward_states = _pass_with_states(sos, x)
     backward, backward_states = _pass_with_states(sos, forward[::-1])
     n_states = 2 * len(sos)
     every_state = np.eye(n_states).reshape(len(sos), 2, n_states)
     free, left = sosfilt(sos, np.zeros((window, n_states)), axis=0, zi=every_state)
-    shapes = np.concatenate([sosfilt(sos, free[::-1], axis=0)[::-1], free[::-1]], axis=1)
+    free_both_ways = [sosfilt(sos, free[::-1], axis=0)[::-1].T, free[::-1].T]
+    filtered = sosfiltfilt(sos, shapes) if len(shapes) else shapes
 
     def flat(states: NDArray[np.float64]) -> NDArray[np.float64]:
         return states.reshape(n_states, *states.shape[2:])
@@ -167,8 +172,13 @@ def filter_in_windows(
     leaving = forward_states[:, :, ends] + np.tensordot(left, entering, 1)
     after = sosfilt(sos, 2 * last[0] - last[1:], axis=0, zi=leaving)[0][::-1]
     returning = flat(sosfilt(sos, after, axis=0, zi=_rest(sos, after[0]))[1] - backward_states[:, :, len(x) - ends])
-    amounts = np.moveaxis(np.concatenate([entering, returning]), 0, -1)
-    return FilteredWindows(starts, backward[::-1], shapes.T, amounts)
+    of_states = np.moveaxis(np.concatenate([entering, returning]), 0, -1)
+    return CutSignal(
+        starts,
+        backward[::-1],
+        np.concatenate([*free_both_ways, filtered]),
+        np.concatenate([of_states, amounts], axis=-1),
+    )
 
 
 def _rest(sos: NDArray[np.float64], x: AnyArray) -> NDArray[np.float64]:
@@ -201,20 +211,44 @@ def zero_phase_matrix(sos: Sections, n: int, every: int = 1) -> NDArray[np.float
     """
     # Its columns are impulses, filtered: the windows that slide over a single one.
     impulse = np.eye(1, 2 * n - 1, n - 1)[0]
-    return filter_in_windows(sos, impulse, np.arange(n)[::-1], n).at(np.arange(0, n, every)).T
+    return filter_in_windows(sos, cut_signal(impulse, np.arange(n)[::-1], n)).at(np.arange(0, n, every)).T
 
 
 def central_differences(
     q: Num[AnyArray, "N *k"], sample_rate: float
-) -> tuple[Float[Array, "N *k"], Float[Array, "N *k"]]:
-    """First and second derivative by central differences; the first and last sample take one-sided ones."""
+) -> tuple[Float[AnyArray, "N *k"], Float[AnyArray, "N *k"]]:
+    """First and second derivative by central differences; the first and last sample take one-sided ones.
+
+    Those of a numpy array are numpy arrays.
+    """
+    concatenate = np.concatenate if isinstance(q, np.ndarray) else jnp.concatenate
     if q.shape[0] < 3:
         raise ValueError(f"{q.shape[0]} samples have no second difference: at least 3 are needed")
     dq = (q[2:] - q[:-2]) * (sample_rate / 2)
     first = (-3 * q[:1] + 4 * q[1:2] - q[2:3]) * (sample_rate / 2)
     last = (3 * q[-1:] - 4 * q[-2:-1] + q[-3:-2]) * (sample_rate / 2)
     ddq = (q[2:] - 2 * q[1:-1] + q[:-2]) * sample_rate**2
-    return jnp.concatenate([first, dq, last]), jnp.concatenate([ddq[:1], ddq, ddq[-1:]])
+    return concatenate([first, dq, last]), concatenate([ddq[:1], ddq, ddq[-1:]])
+
+
+def differences_in_windows(signal: CutSignal, sample_rate: float) -> tuple[CutSignal, CutSignal]:
+    """`central_differences` of every window by itself."""
+    starts, x, shapes, amounts = signal
+    window = shapes.shape[1]
+    of_shapes = central_differences(shapes.T, sample_rate)
+    three = np.arange(3)[:, None]
+    first, last = starts, starts + window - 1
+    one_sided = [central_differences(x[start + three], sample_rate) for start in (first, last - 2)]
+    results = []
+    for k, whole in enumerate(central_differences(x, sample_rate)):
+        ends = np.stack([one_sided[0][k][0] - whole[first], one_sided[1][k][-1] - whole[last]], axis=-1)
+        at_ends = np.eye(window)[[0, -1]]
+        results.append(
+            CutSignal(
+                starts, whole, np.concatenate([at_ends, of_shapes[k].T]), np.concatenate([ends, amounts], axis=-1)
+            )
+        )
+    return results[0], results[1]
 
 
 def autocovariance(sos: Sections, every: int = 1, tolerance: float = 1e-9) -> NDArray[np.float64]:

@@ -17,6 +17,8 @@ from jaximp.signals import (
     autocovariance,
     butterworth,
     central_differences,
+    cut_signal,
+    differences_in_windows,
     fill_gaps,
     filter_in_windows,
     filter_zero_phase,
@@ -90,16 +92,23 @@ def test_filtering_in_windows_is_scipys_in_each(
 ) -> None:
     x = 3 + noise(shape).cumsum(axis=0)
     starts = np.arange(0, shape[0] - window + 1, step)
-    found = filter_in_windows(sos, x, starts, window).at(np.arange(window))
+    found = filter_in_windows(sos, cut_signal(x, starts, window)).at(np.arange(window))
     expected = np.stack([sosfiltfilt(sos, x[start : start + window], axis=0) for start in starts])
     assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
-def test_windows_without_a_filter_stay_as_they_are() -> None:
-    x, starts = noise((50, 2)), np.array([0, 7, 30])
-    every_other = np.arange(0, 20, 2)
-    found = filter_in_windows(None, x, starts, 20).at(every_other)
-    np.testing.assert_array_equal(found, np.stack([x[start : start + 20 : 2] for start in starts]))
+@pytest.mark.parametrize("shape", [(300,), (300, 2)])
+def test_what_is_done_in_windows_can_be_done_one_after_another(shape: tuple[int, ...]) -> None:
+    """Filter, differences, and filter again: of every window, and of every other sample in it."""
+    position, parallel = butterworth(8, 100, RATE), butterworth(4, 60, RATE)
+    x, starts, window = 3 + noise(shape).cumsum(axis=0), np.arange(0, 201, 20), 100
+    every_other = np.arange(0, window, 2)
+    q = filter_in_windows(position, cut_signal(x, starts, window))
+    for k, derivative in enumerate(differences_in_windows(q, RATE)):
+        found = filter_in_windows(parallel, derivative).at(every_other)
+        cuts = (sosfiltfilt(position, x[start : start + window], axis=0) for start in starts)
+        expected = np.stack([sosfiltfilt(parallel, central_differences(cut, RATE)[k], axis=0)[::2] for cut in cuts])
+        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("sos", FILTERS)

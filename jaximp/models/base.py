@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
+MOTION = ("q", "dq", "ddq", "1")
+"""Columns of one joint that are linear in its motion: position, velocity, acceleration, and a constant one."""
+
 
 class Model(eqx.Module):
     """A model that is linear in its parameters.
@@ -19,7 +22,8 @@ class Model(eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
     """SI unit of each parameter."""
     columns: tuple[str, ...] = eqx.field(static=True)
-    """What each column is made of, such as `ddq` or `sin(q/15)`: equal text means equal numbers."""
+    """What each column is made of, such as `ddq` or `sin(q/15)`: equal text means equal numbers. Those in `MOTION` are
+    the motion itself, and a constant."""
     label: str = eqx.field(static=True)
     """What goes in front of the names when models are stacked, such as `robot`."""
     n_joints: int = eqx.field(static=True)
