@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.models import HumanJoint, Joints, Model, RobotJoint, combine, parameter_units
+from jaximp.models import MOTION, HumanJoint, Joints, Model, RobotJoint, combine, parameter_units
+from jaximp.models.joint import sine_and_cosine
 
 Numbers = NDArray[np.float64]
 Torque = Callable[[Numbers, Numbers, Numbers, Numbers], Numbers]
@@ -201,6 +202,16 @@ def test_every_column_has_one_name_and_one_unit(case: Case) -> None:
 
 
 @every_model
+def test_columns_called_as_the_motion_are_the_motion(case: Case) -> None:
+    q, dq, ddq = motion(case.model, 20)
+    W = case.model.regressor(q, dq, ddq)
+    for k, column in enumerate(case.model.columns):
+        if column in MOTION and case.model.n_joints == 1:
+            expected = dict(zip(MOTION, (q, dq, ddq, np.ones(20)), strict=True))[column]
+            np.testing.assert_array_equal(W[:, k], expected)
+
+
+@every_model
 @pytest.mark.parametrize("batch", [(), (6,), (2, 1, 3), (0,)], ids=str)
 def test_batches_of_any_shape(case: Case, batch: tuple[int, ...]) -> None:
     """Shapes only, so that nothing need be compiled."""
@@ -350,3 +361,21 @@ def test_equilibrium_is_where_the_elastic_torque_vanishes(ratio: float) -> None:
 def test_errors_name_the_cause(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("largest", [1.0, 30.0, 1e6])
+def test_sine_and_cosine_are_the_c_librarys(largest: float) -> None:
+    quarters = np.linspace(-largest, largest, 101) // (np.pi / 4) * (np.pi / 4)
+    x = np.concatenate([np.random.default_rng(0).uniform(-largest, largest, 10_000), quarters])
+    sine, cosine = sine_and_cosine(jnp.asarray(x))
+    np.testing.assert_allclose(sine, np.sin(x), rtol=0, atol=4e-16)
+    np.testing.assert_allclose(cosine, np.cos(x), rtol=0, atol=4e-16)
+
+
+def test_sine_and_cosine_differentiate_and_take_single_precision() -> None:
+    at = jnp.asarray(2.5)
+    np.testing.assert_allclose(jax.jacobian(sine_and_cosine)(at), [np.cos(2.5), -np.sin(2.5)], rtol=1e-15)
+    np.testing.assert_allclose(jax.hessian(sine_and_cosine)(at), [-np.sin(2.5), -np.cos(2.5)], rtol=1e-15)
+    single = sine_and_cosine(at.astype(jnp.float32))
+    assert {part.dtype for part in single} == {np.dtype(np.float32)}
+    np.testing.assert_allclose(single, [np.sin(2.5), np.cos(2.5)], rtol=1e-6)

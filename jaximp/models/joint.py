@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
@@ -131,16 +132,70 @@ class RobotJoint(Model):
         self.n_joints = 1
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
-        angle = q / self.gear_ratio
+        sine, cosine = sine_and_cosine(q / self.gear_ratio)
         column = {
-            "gravity_x": self.g * jnp.sin(angle),
-            "gravity_y": self.g * jnp.cos(angle),
+            "gravity_x": self.g * sine,
+            "gravity_y": self.g * cosine,
             "viscous_friction": dq,
             "coulomb_friction": jnp.sign(dq),
             "inertia": ddq,
             "offset_torque": jnp.ones_like(q),
         }
         return jnp.stack([column[name] for name in self.names])
+
+
+QUARTER_TURN = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+"""A quarter turn in parts of 33 binary digits (the last is what is left), so that their multiples are exact."""
+SINE = (
+    1.58969099521155010221e-10,
+    -2.50507602534068634195e-08,
+    2.75573137070700676789e-06,
+    -1.98412698298579493134e-04,
+    8.33333333332248946124e-03,
+    -1.66666666666666324348e-01,
+)
+"""Coefficients of the C library (fdlibm), `sin(r) = r + r^3 * polynomial(r^2)` within an eighth of a turn."""
+COSINE = (
+    -1.13596475577881948265e-11,
+    2.08757232129817482790e-09,
+    -2.75573143513906633035e-07,
+    2.48015872894767294178e-05,
+    -1.38888888888741095749e-03,
+    4.16666666666666019037e-02,
+)
+"""And `cos(r) = 1 - r^2/2 + r^4 * polynomial(r^2)`."""
+
+
+@jax.custom_jvp
+def sine_and_cosine(x: Num[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Sine and cosine of an angle [rad], to 2e-16 up to a million; on a CPU in a tenth of the time of `jnp`'s.
+
+    XLA has the sines of doubles computed one by one by the C library, but evaluates polynomials eight at a time. In
+    windows that are filtered each by itself nearly all of the time went there.
+    """
+    return _by_polynomials(x) if x.dtype == jnp.float64 else (jnp.sin(x), jnp.cos(x))
+
+
+@sine_and_cosine.defjvp
+def _derivative(at: tuple[Array], direction: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    sine, cosine = sine_and_cosine(*at)
+    return (sine, cosine), (cosine * direction[0], -sine * direction[0])
+
+
+@jax.jit
+def _by_polynomials(x: Array) -> tuple[Array, Array]:
+    quarters = jnp.round(x / (np.pi / 2))
+    r = x
+    for part in QUARTER_TURN:
+        r = r - quarters * part
+    sine, cosine = jnp.zeros_like(r), jnp.zeros_like(r)
+    for of_sine, of_cosine in zip(SINE, COSINE, strict=True):
+        sine, cosine = sine * r**2 + of_sine, cosine * r**2 + of_cosine
+    sine, cosine = r + r**3 * sine, 1 - r**2 / 2 + r**4 * cosine
+    quarter = quarters - 4 * jnp.floor(quarters / 4)
+    odd = (quarter == 1) | (quarter == 3)
+    sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
+    return jnp.where(quarter >= 2, -sine, sine), jnp.where((quarter == 1) | (quarter == 2), -cosine, cosine)
 
 
 def _positive(gear_ratio: float) -> float:
