@@ -134,7 +134,7 @@ def solve_all(recording: Piece, task: Task) -> Any:
         for whole, some in zip(jax.tree.leaves(found), jax.tree.leaves(solved), strict=True):
             whole[first : first + plan.windows] = some
 
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(solve, range(0, n_windows, plan.windows)))
     return found
 
@@ -152,10 +152,10 @@ def _empty(n_windows: int, p: int, dtype: Any, statistics: bool) -> Any:
 def solve_pieces(pieces: Iterable[Piece], task: Task) -> Iterator[SlidingFit]:
     """Every window of a recording that comes piece by piece; as many pieces are held as a few chunks need."""
     waiting: deque[Future[SlidingFit]] = deque()
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for count, rows in enumerate(_chunks_of(pieces, task)):
             waiting.append(pool.submit(_solve_rows, task, count * task.plan.windows, rows))
-            if len(waiting) > 2 * _cores():
+            if len(waiting) > 2 * cores():
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -267,7 +267,8 @@ def _cut(pieces: list[Piece], start: int, stop: int | None) -> list[Piece]:
     return parts
 
 
-def _cores() -> int:
+def cores() -> int:
+    """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
-from jaximp.chunks import _cores
+from jaximp.chunks import cores
 from jaximp.job import FilterSettings, Job
 from jaximp.models import MOTION, Model
 from jaximp.types import AnyArray, Recording
@@ -254,7 +254,7 @@ def _other_columns(
     n_windows, window = len(q.starts), q.shapes.shape[1]
     step = int(q.starts[1]) if n_windows > 1 else 1
     at_a_time = max(1, min(n_windows, CACHED_NUMBERS // (window * model.n_joints)))
-    per_part = at_a_time * min(MOST_BATCHES, -(-n_windows // (at_a_time * _cores())))
+    per_part = at_a_time * min(MOST_BATCHES, -(-n_windows // (at_a_time * cores())))
     behind = -n_windows % per_part
     whole, amounts = _zeros_behind(q.whole, behind * step), _zeros_behind(q.amounts, behind)
     shapes, response = jnp.asarray(q.shapes), _response(filters, window)
@@ -267,7 +267,7 @@ def _other_columns(
         sizes = (sample_rate, filters.decimate, step, at_a_time)
         found[part] = _columns(model, chosen, *sizes, samples, shapes, amounts[part], response)[: n_windows - first]
 
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(put, range(0, n_windows, per_part)))
     return found
 
