@@ -394,8 +394,8 @@ def _threshold(
     reference = recording.reference[:period]
     if len(reference) < period or not np.isfinite(reference).all():
         return None, "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
-    dq, ddq = signals.central_differences(jnp.asarray(reference), rate)
-    motion = tuple(x[:, 0] if recording.n_joints == 1 else x for x in (jnp.asarray(reference), dq, ddq))
+    dq, ddq = signals.central_differences(reference, rate)
+    motion = tuple(x[:, 0] if recording.n_joints == 1 else x for x in (reference, dq, ddq))
     W = model.observation_matrix(*motion).reshape(-1, len(model.names))
     return float(fake_change_threshold(W, period, round(job.window.length * rate * place.counted / place.window))), ""
 
