@@ -27,7 +27,7 @@ from jaximp.engine import BLOCK, ChunkFit, Plan, Statistics, Wanted, solve_chunk
 from jaximp.least_squares import SlidingFit, WindowFit, solve_window
 from jaximp.types import AnyArray
 
-LANES = {True: 500, False: 1000}
+LANES = {True: 500, False: 800}
 """Blocks in a chunk, with and without statistics; no power of two, which would crowd the cache."""
 REPAIR_NUMBERS = 150_000
 """How many numbers of doubtful windows are decomposed at a time: so many fit into the cache."""

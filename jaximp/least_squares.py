@@ -151,7 +151,10 @@ def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:
     """Refuse numbers that are not finite where `valid` does not exclude them; while tracing nothing is known yet."""
     if any(isinstance(array, jax.core.Tracer) for array in (W, y, valid)):
         return
-    finite = np.isfinite(np.asarray(W)).all(axis=-1) & np.isfinite(np.asarray(y))
+    W, y = np.asarray(W), np.asarray(y)
+    if np.isfinite(W).all() and np.isfinite(y).all():
+        return
+    finite = np.isfinite(W).all(axis=-1) & np.isfinite(y)
     bad = int((~finite & np.asarray(valid)).sum())
     if bad:
         raise ValueError(f"{bad} samples of W or y are not finite: mark them with valid=False, or mend them")
