@@ -1,7 +1,7 @@
 """Least squares in sliding windows, this project beside its peers, in one run; ratios count, seconds do not.
 
 Every measurement is a process of its own, so that none inherits the other's memory or compiled code; the peers
-(`pip install polars-ols statsmodels padasip`) run between ours. Writes results/sliding_windows.json and .md.
+(`pip install -e '.[peers]'`) run between ours. Writes results/sliding_windows.json and .md.
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ if __name__ == "__main__":
         sys.exit(0)
     missing = [name for name in PEERS if find_spec(name) is None]
     if missing:
-        print(f"skipped: the peers {', '.join(missing)} are not installed (pip install polars-ols statsmodels padasip)")
+        print(f"skipped: the peers {', '.join(missing)} are not installed (pip install -e '.[peers]')")
         sys.exit(0)
     found, rows = run()
     table = [f"{machine()}\n", "| what | target | reached |", "| --- | --- | --- |"]
