@@ -103,6 +103,142 @@ def at_rest(series: FourierSeries) -> FourierSeries:
     return FourierSeries(sine, cosine, series.offset, series.period)
 
 
+_ORDERS = np.array([0, 1, 2, 0, 1, 2])
+"""Six numbers describe a piece of fifth order: position, velocity, acceleration at u = 0, then at u = 1."""
+
+_QUINTIC = np.array(
+    [
+        [1, 0, 0, 0, 0, 0],
+        [0, 1, 0, 0, 0, 0],
+        [0, 0, 0.5, 0, 0, 0],
+        [-10, -6, -1.5, 10, -4, 0.5],
+        [15, 8, 1.5, -15, 7, -1],
+        [-6, -3, -0.5, 6, -3, 0.5],
+    ]
+)
+"""Coefficients of u^0 .. u^5 from them."""
+
+_SQUARED_JERK = _QUINTIC[3:].T @ np.array([[36, 72, 120], [72, 192, 360], [120, 360, 720]]) @ _QUINTIC[3:]
+"""Its integral from u = 0 to 1, as a quadratic form of them."""
+
+
+class MinimumJerk(eqx.Module):
+    """Smoothest motion through way points: least integral of the squared jerk, over all motions that meet them.
+
+    Two points and the defaults make the fifth-order polynomial from rest to rest, `u^3 (10 - 15 u + 6 u^2)` with
+    `u = t / duration`. More points make a chain of such polynomials that is continuous up to the fourth derivative;
+    e.g. `MinimumJerk([0, 0.05, 0], 0.1)` goes out and back. Before the first point and after the last one the velocity
+    stays as it is there, zero by default.
+
+    **Source:** Lakatos et al. 2011, eqs. (15), (16), who name Flash and Hogan 1985. Eq. (15) is read as the integral of
+    the squared jerk from 0 to t_f.
+    """
+
+    points: Float[Any, "k *n"] = array_field()
+    """(k, *n) positions that are passed [rad], k >= 2."""
+    durations: Float[Any, "k-1"] | Float[Any, ""] = array_field()
+    """(k - 1,) times from point to point [s], or one for all."""
+    end_velocities: Float[Any, "2 *n"] | Float[Any, ""] = array_field(default=0.0)
+    """(2, *n) velocities at the first and at the last point [rad/s], or one for all."""
+    end_accelerations: Float[Any, "2 *n"] | Float[Any, ""] = array_field(default=0.0)
+    """(2, *n) accelerations there [rad/s^2], or one for all."""
+
+    def __check_init__(self) -> None:
+        if self.points.ndim == 0 or self.points.shape[0] < 2:
+            raise ValueError(f"points is {self.points.shape}: give at least a start and an end along its first axis")
+        k, *joints = self.points.shape
+        expected = {"durations": (k - 1,), "end_velocities": (2, *joints), "end_accelerations": (2, *joints)}
+        for name, shape in expected.items():
+            if (found := getattr(self, name).shape) not in ((), shape):
+                raise ValueError(f"{name} is {found}: points {self.points.shape} need {shape} or one number")
+        _require_positive(durations=self.durations)
+
+    def __call__(self, t: Float[ArrayLike, "*t"]) -> Motion:
+        ends = np.array([0, -1])
+        states = jnp.zeros((self.points.shape[0], 3, *self.points.shape[1:])).at[:, 0].set(self.points)
+        states = states.at[ends, 1].set(self.end_velocities).at[ends, 2].set(self.end_accelerations)
+        durations = jnp.broadcast_to(self.durations, (self.points.shape[0] - 1,))
+        if len(durations) > 1:
+            states = _with_least_jerk(states, durations)
+        rows = _QUINTIC * durations[:, None, None] ** (_ORDERS - np.arange(6)[:, None])
+        pieces = jnp.einsum("mij,mj...->im...", rows, jnp.concatenate([states[:-1], states[1:]], axis=1))
+        return _piecewise_polynomial(pieces, states[-1, :2], durations, jnp.asarray(t, float))
+
+
+class SixthOrder(eqx.Module):
+    """Polynomial of sixth order from rest to rest that ends without jerk: `u^3 (20 - 45 u + 36 u^2 - 10 u^3)`.
+
+    The rival of the fifth order in Lakatos et al. 2011, III-B. The seventh condition is read as zero jerk at t_f
+    (the sixth one is printed twice). No motion has the least squared jerk under it: motions that drop their jerk just
+    before the end come as close to the fifth order as one likes. This one has the least integral of
+    `jerk(t)^2 / (t_f - t)`.
+    """
+
+    start: Float[Any, "*n"] = array_field()
+    """(*n) position up to t = 0 [rad]."""
+    end: Float[Any, "*n"] = array_field()
+    """(*n) position from t = duration on [rad]."""
+    duration: Float[Any, ""] = array_field()
+    """[s]."""
+
+    def __check_init__(self) -> None:
+        if self.start.shape != self.end.shape:
+            raise ValueError(f"start is {self.start.shape} and end {self.end.shape}: give both the same joints")
+        _require_positive(duration=self.duration)
+
+    def __call__(self, t: Float[ArrayLike, "*t"]) -> Motion:
+        start, end, duration = (jnp.asarray(x, float) for x in (self.start, self.end, self.duration))
+        powers = duration ** np.arange(3, 7)
+        way = jnp.multiply.outer(np.array([20, -45, 36, -10]) / powers, end - start)
+        rest = jnp.zeros_like(start)
+        piece = jnp.concatenate([jnp.stack([start, rest, rest]), way])[:, None]
+        return _piecewise_polynomial(piece, jnp.stack([end, rest]), duration[None], jnp.asarray(t, float))
+
+
+def _with_least_jerk(states: Float[Array, "k 3 *n"], durations: Float[Array, "k-1"]) -> Float[Array, "k 3 *n"]:
+    """The squared jerk is a quadratic form of all states: its minimum over velocities and accelerations, which have to
+    be zero between the ends."""
+    k, i = states.shape[0], np.arange(states.shape[0] - 1)
+    cost = _SQUARED_JERK * durations[:, None, None] ** (_ORDERS[:, None] + _ORDERS - 5)
+    form = jnp.zeros((k, 3, k, 3))
+    for a in (0, 1):
+        for b in (0, 1):
+            form = form.at[i + a, :, i + b, :].add(cost[:, 3 * a : 3 * a + 3, 3 * b : 3 * b + 3])
+    slope = jnp.tensordot(form[1:-1, 1:], states, 2)
+    matrix = form[1:-1, 1:, 1:-1, 1:].reshape(2 * k - 4, 2 * k - 4)
+    # Cholesky does not mind units: those of velocity and acceleration differ, durations may as well.
+    step = jax.scipy.linalg.solve(matrix, slope.reshape(2 * k - 4, -1), assume_a="pos")
+    return states.at[1:-1, 1:].add(-step.reshape(slope.shape))
+
+
+def _piecewise_polynomial(
+    pieces: Float[Array, "orders m *n"], end: Float[Array, "2 *n"], durations: Float[Array, " m"], t: Float[Array, "*t"]
+) -> Motion:
+    """Polynomials in the time since their beginning, one after the other from t = 0 on, between two straight lines: one
+    up to the first polynomial, with its position and velocity there, and one from those of `end` on."""
+    straight = jnp.zeros_like(pieces[:, :1])
+    before, after = straight.at[:2, 0].set(pieces[:2, 0]), straight.at[:2, 0].set(end)
+    index, x = _locate(durations, t)
+    c = jnp.concatenate([before, pieces, after], axis=1)[:, index]
+    x = x.reshape(t.shape + (1,) * (pieces.ndim - 2))
+    position = velocity = half_acceleration = jnp.zeros_like(c[0])
+    for coefficient in reversed(list(c)):  # Horner's scheme and its derivatives
+        half_acceleration = half_acceleration * x + velocity
+        velocity = velocity * x + position
+        position = position * x + coefficient
+    return position, velocity, 2 * half_acceleration
+
+
+def _locate(durations: Float[Array, " m"], t: Float[Array, "*t"]) -> tuple[Array, Float[Array, "*t"]]:
+    """Piece at each time, 0 before the first and m + 1 after the last, and the time since it began (piece 0: ends).
+
+    A border belongs to the piece that begins there, but the last one to piece m: both ends are part of the motion.
+    """
+    borders = jnp.concatenate([jnp.zeros(1), jnp.cumsum(durations)])
+    piece = jnp.sum(t[..., None] >= borders[:-1], axis=-1) + (t > borders[-1])
+    return piece, t - borders[jnp.maximum(piece - 1, 0)]
+
+
 def _require_positive(**values: Any) -> None:
     for name, value in values.items():
         known = not isinstance(value, jax.core.Tracer)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaximp.simulation.rig import GRAVITY, HUMAN_TRAJECTORY, ROBOT_TRAJECTORY
-from jaximp.trajectories import FourierSeries, at_rest, jerk
+from jaximp.trajectories import FourierSeries, MinimumJerk, SixthOrder, at_rest, jerk
 
 SERIES = FourierSeries(sine=[0.4, -1.2, 0.3], cosine=[0.7, 0.1, -0.5], offset=0.2, period=4.0)
 TWO_SERIES = FourierSeries(
@@ -20,10 +20,16 @@ TWO_SERIES = FourierSeries(
     offset=[0.2, -0.4],
     period=4.0,
 )
+WAY_POINTS = np.array([[0.1, 0.0], [1.0, -0.5], [0.4, 0.2], [0.6, 0.9]])
+DURATIONS = np.array([0.3, 0.2, 0.5])
+IN_MOTION = MinimumJerk([0.1, 0.6], 0.5, end_velocities=[1.0, -2.0], end_accelerations=[3.0, 4.0])
 
 TRAJECTORIES = {
     "series": SERIES,
     "two series at rest": at_rest(TWO_SERIES),
+    "in motion": IN_MOTION,
+    "two chains": MinimumJerk(WAY_POINTS, DURATIONS, end_velocities=[[0.0, 0.2], [0.3, 0.0]]),
+    "sixth order": SixthOrder(0.1, 0.6, 0.5),
 }
 every_trajectory = pytest.mark.parametrize("trajectory", TRAJECTORIES.values(), ids=TRAJECTORIES.keys())
 TIMES = jnp.array([[-0.1, 0.0, 0.03, 0.08, 0.11, 0.16, 0.27, 0.28], [0.3, 0.39, 0.4, 0.5, 0.7, 1.0, 1.3, 4.0]])
@@ -105,6 +111,134 @@ def test_two_harmonics_at_rest_keep_only_sines() -> None:
         at_rest(FourierSeries(sine=[1.0], cosine=[1.0]))
 
 
+def least_jerk(
+    start: tuple[float, float, float], conditions: list[tuple[int, float, float]], ease: Callable[[np.ndarray], Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jerk in 4000 cells of one second whose square, over `ease`, has the least sum: eq. (15) of Lakatos et al. 2011.
+
+    A condition is (order, time, value) of a derivative. All of them are linear in the jerk.
+    """
+    t = (np.arange(4000) + 0.5) / 4000
+    rows, values = [], []
+    for order, time, value in conditions:
+        q, dq, ddq = start
+        left = np.maximum(time - t, 0.0)
+        rows.append(np.stack([left**2 / 2, left, left > 0])[order] / 4000)
+        values.append(value - [q + dq * time + ddq * time**2 / 2, dq + ddq * time, ddq][order])
+    A, eased = np.stack(rows), np.stack(rows) * ease(t)
+    return t, eased.T @ np.linalg.solve(A @ eased.T, np.array(values))
+
+
+REST = [(0, 1.0, 0.6), (1, 1.0, 0.0), (2, 1.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "start", "conditions", "ease"),
+    [
+        pytest.param(MinimumJerk([0.1, 0.6], 1.0), (0.1, 0.0, 0.0), REST, np.ones_like, id="fifth order"),
+        pytest.param(
+            MinimumJerk([0.1, 0.6], 1.0, IN_MOTION.end_velocities, IN_MOTION.end_accelerations),
+            (0.1, 1.0, 3.0),
+            [(0, 1.0, 0.6), (1, 1.0, -2.0), (2, 1.0, 4.0)],
+            np.ones_like,
+            id="in motion",
+        ),
+        pytest.param(
+            MinimumJerk([0.1, 1.0, 0.4, 0.6], DURATIONS),
+            (0.1, 0.0, 0.0),
+            [(0, 0.3, 1.0), (0, 0.5, 0.4), *REST],
+            np.ones_like,
+            id="chain",
+        ),
+        pytest.param(
+            MinimumJerk([0.0, 0.05, 0.0], 0.5),
+            (0.0, 0.0, 0.0),
+            [(0, 0.5, 0.05), (0, 1.0, 0.0), *REST[1:]],
+            np.ones_like,
+            id="out and back",
+        ),
+        pytest.param(SixthOrder(0.1, 0.6, 1.0), (0.1, 0.0, 0.0), REST, lambda t: 1 - t, id="sixth order"),
+    ],
+)
+def test_polynomials_minimise_the_squared_jerk(
+    trajectory: Any,
+    start: tuple[float, float, float],
+    conditions: list[tuple[int, float, float]],
+    ease: Callable[[np.ndarray], Any],
+) -> None:
+    t, best = least_jerk(start, conditions, ease)
+    values = np.stack(motion(trajectory, np.append(t, [time for _, time, _ in conditions])))
+    found, ends = values[3, : len(t)], values[:, len(t) :]
+    np.testing.assert_allclose(found, best, atol=1e-5 * np.abs(best).max())
+    assert np.sum(found**2 / ease(t)) == pytest.approx(np.sum(best**2 / ease(t)), rel=1e-5)
+    for i, (order, _, value) in enumerate(conditions):
+        assert ends[order, i] == pytest.approx(value, abs=1e-12)
+
+
+def test_sixth_order_has_more_jerk_than_motions_that_drop_it_just_before_the_end() -> None:
+    _, dropped = least_jerk((0.1, 0.0, 0.0), REST, lambda t: t < 0.999)
+    assert dropped[-1] == 0
+    assert np.mean(dropped**2) == pytest.approx(720 * 0.5**2, rel=0.02)
+    _, eased = least_jerk((0.1, 0.0, 0.0), REST, lambda t: 1 - t)
+    assert np.mean(eased**2) == pytest.approx((720 + 3600 / 7) * 0.5**2, rel=1e-5)
+
+
+def test_sixth_order_ends_without_jerk_and_is_less_balanced() -> None:
+    t_f = 0.3
+    t, weights = np.polynomial.legendre.leggauss(7)
+
+    def ratios(trajectory: Any) -> np.ndarray:
+        """Eq. (17); seven points are exact for these polynomials."""
+        squares = [weights @ np.square(x) for x in motion(trajectory, t_f * (t + 1) / 2)[1:]]
+        return np.array([squares[0] / squares[1], squares[0] / squares[2], squares[1] / squares[2]])
+
+    fifth, sixth = ratios(MinimumJerk([0.0, 0.05], t_f)), ratios(SixthOrder(0.0, 0.05, t_f))
+    assert motion(SixthOrder(0.0, 0.05, t_f), np.full(7, t_f))[3] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(fifth, [t_f**2 / 12, t_f**4 / 504, t_f**2 / 42], rtol=1e-9)
+    np.testing.assert_allclose(sixth, [3 * t_f**2 / 44, t_f**4 / 792, t_f**2 / 54], rtol=1e-9)
+    assert (sixth < fifth).all()
+    assert (fifth < 1).all()
+
+
+def test_chain_of_unlike_durations_is_smooth_to_the_fourth_derivative() -> None:
+    durations = np.array([2.0, 0.02, 10.0])
+    chain = MinimumJerk(WAY_POINTS, durations)
+    borders = np.cumsum(durations)[:-1]
+
+    @jax.jit
+    def with_snap(t: jax.Array) -> tuple[jax.Array, ...]:
+        return (*chain(t), *jax.jvp(lambda t: jerk(chain, t), (t,), (jnp.ones_like(t),)))
+
+    before, after = np.split(np.stack(with_snap(np.concatenate([borders * (1 - 1e-13), borders]))), 2, axis=1)
+    np.testing.assert_allclose(after[0], WAY_POINTS[1:-1], atol=1e-12)
+    for left, right in zip(before, after, strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-7, atol=1e-7 * np.abs(right).max())
+
+
+def test_chains_of_several_joints_are_those_of_each() -> None:
+    together = TRAJECTORIES["two chains"]
+    for j, velocities in enumerate([[0.0, 0.3], [0.2, 0.0]]):
+        alone = MinimumJerk(WAY_POINTS[:, j], DURATIONS, end_velocities=velocities)
+        for values, value in zip(motion(together, TIMES), motion(alone, TIMES), strict=True):
+            np.testing.assert_allclose(values[..., j], value, atol=1e-10)
+
+
+def test_outside_the_motion_rests_or_goes_straight_on() -> None:
+    before, after = TIMES < 0, TIMES > 0.5
+    for rests, jerks in ((MinimumJerk([0.1, 0.6], 0.5), [240.0, 240.0]), (SixthOrder(0.1, 0.6, 0.5), [480.0, 0.0])):
+        q, dq, ddq, dddq = motion(rests, TIMES)
+        np.testing.assert_allclose(dddq[(TIMES == 0.0) | (TIMES == 0.5)], jerks, atol=1e-10)
+        np.testing.assert_array_equal(q[before], 0.1)
+        np.testing.assert_array_equal(q[after], 0.6)
+        np.testing.assert_array_equal([dq[before | after], ddq[before | after]], 0.0)
+    q, dq, ddq, _ = motion(IN_MOTION, TIMES)
+    np.testing.assert_allclose(q[before], 0.1 + TIMES[before], atol=1e-14)
+    np.testing.assert_allclose(q[after], 0.6 - 2 * (TIMES[after] - 0.5), atol=1e-14)
+    np.testing.assert_array_equal(dq[after], -2.0)
+    np.testing.assert_array_equal(ddq[before | after], 0.0)
+    np.testing.assert_allclose([ddq[TIMES == 0.0], ddq[TIMES == 0.5]], [[3.0], [4.0]], atol=1e-12)
+
+
 def test_series_is_periodic() -> None:
     for values, later in zip(TWO_SERIES(TIMES), TWO_SERIES(TIMES + 4.0), strict=True):
         np.testing.assert_allclose(values, later, atol=1e-12)
@@ -119,6 +253,17 @@ def test_coefficients_are_differentiable_and_batchable() -> None:
     np.testing.assert_allclose(jax.jit(jax.vmap(displacement))(jnp.eye(3)), np.sin(w * 0.5) / w, atol=1e-12)
 
 
+def test_trajectories_are_made_inside_compiled_and_batched_functions() -> None:
+    @jax.jit
+    @jax.vmap
+    def halfway(duration: jax.Array) -> list[jax.Array]:
+        made = [MinimumJerk([0, 1], duration), SixthOrder(0, 1, duration)]
+        return [trajectory(duration / 2)[0] for trajectory in made]
+
+    for positions, expected in zip(halfway(jnp.array([0.1, 2.0])), [0.5, 0.65625], strict=True):
+        np.testing.assert_allclose(positions, expected, atol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -128,6 +273,15 @@ def test_coefficients_are_differentiable_and_batchable() -> None:
         (lambda: FourierSeries(np.zeros((2, 3)), np.zeros(3)), r"sine is \(2, 3\), cosine \(3,\), .* \(joints,\)"),
         (lambda: FourierSeries(np.zeros(3), np.zeros(3), np.zeros(2)), r"offset \(2,\): .* one offset"),
         (lambda: FourierSeries(np.zeros(3), np.zeros(3), period=0.0), "period is 0.0: it must be positive"),
+        (lambda: MinimumJerk(0.5, 1.0), "give at least a start and an end"),
+        (lambda: MinimumJerk([0.5], 1.0), "give at least a start and an end"),
+        (lambda: MinimumJerk([0, 1, 2], [1.0, -1.0]), r"durations is \[1.0, -1.0\]: it must be positive"),
+        (lambda: MinimumJerk([0, 1], np.inf), "durations is inf: it must be positive and finite"),
+        (lambda: MinimumJerk([0, 1, 2], [1, 1, 1]), r"durations is \(3,\): points \(3,\) need \(2,\) or one number"),
+        (lambda: MinimumJerk(np.zeros((3, 2)), 1, [0, 1]), r"end_velocities is \(2,\): .* need \(2, 2\) or one number"),
+        (lambda: MinimumJerk([0, 1], 1, 0, [0, 1, 2]), r"end_accelerations is \(3,\): .* need \(2,\) or one number"),
+        (lambda: SixthOrder(0.0, [1.0, 2.0], 1.0), r"start is \(\) and end \(2,\): give both the same joints"),
+        (lambda: SixthOrder(0.0, 1.0, -1.0), "duration is -1.0: it must be positive"),
     ],
 )
 def test_wrong_parameters_are_refused(make: Callable[[], Any], message: str) -> None:
