@@ -195,6 +195,64 @@ class SixthOrder(eqx.Module):
         return _piecewise_polynomial(piece, jnp.stack([end, rest]), duration[None], jnp.asarray(t, float))
 
 
+class RaisedSine(eqx.Module):
+    """Perturbation out and back: all of it is zero before t = 0 and after `duration (1 + ratio)`.
+
+    The acceleration is eq. (27), `amplitude sin(2 pi t / duration)^2` in the first half of `duration` and minus that in
+    the second, and then the same again, `ratio` times as long and minus `ratio^-2` times as high: the one height that
+    brings the position back to zero. It is farthest away, by `amplitude duration^2 / 8`, at t = duration.
+
+    **Source:** Börner et al. 2020, eqs. (27), (28). T_p is read as the duration of each of the two profiles, and the
+    second as beginning when the first one ends. Several axes, eq. (29): `amplitude * [cos(angle), sin(angle)]`.
+    """
+
+    amplitude: Float[Any, "*n"] = array_field()
+    """(*n) first peak of the acceleration, A_p,1 [m/s^2]."""
+    duration: Float[Any, ""] = array_field()
+    """Of the first profile, T_p,1 [s]."""
+    ratio: Float[Any, ""] = array_field(default=1.5)
+    """Duration of the second profile over that of the first."""
+
+    def __check_init__(self) -> None:
+        _require_positive(duration=self.duration, ratio=self.ratio)
+
+    @classmethod
+    def of_displacement(cls, peak: ArrayLike, duration: ArrayLike, ratio: ArrayLike = 1.5) -> RaisedSine:
+        """With the largest displacement `peak` (*n) [m]: the static task of Börner et al. 2020 (8 mm, 160 ms)."""
+        return cls(8 * jnp.asarray(peak) / jnp.asarray(duration) ** 2, duration, ratio)
+
+    @classmethod
+    def of_force(
+        cls, peak: ArrayLike, duration: ArrayLike, inertia: ArrayLike, damping: ArrayLike, ratio: ArrayLike = 1.5
+    ) -> RaisedSine:
+        """With the first peak (*n) [N] of the force `inertia * ddq + damping * dq`: the dynamic task of Börner et al.
+        2020 (40 N, 70 ms, 5 kg, 20 N s/m)."""
+        # At x = w t the force of unit amplitude is mass sin(x/2)^2 + damping (x - sin x) / (2 w): d/dx = 0 where
+        # tan(x/2) = -mass w / damping.
+        mass, w = jnp.asarray(inertia), 4 * jnp.pi / jnp.asarray(duration)
+        x = 2 * jnp.arctan2(mass * w, -jnp.asarray(damping))
+        force = mass * jnp.sin(x / 2) ** 2 + damping / (2 * w) * (x - jnp.sin(x))
+        return cls(jnp.asarray(peak) / force, duration, ratio)
+
+    def __call__(self, t: Float[ArrayLike, "*t"]) -> Motion:
+        half, ratio = jnp.asarray(self.duration, float) / 2, jnp.asarray(self.ratio, float)
+        # The rest before, the four humps of the acceleration, the rest after; with what each of them begins with.
+        lengths = half * jnp.array([1, 1, 1, ratio, ratio, 1])
+        heights = jnp.array([0, 1, -1, -(ratio**-2), ratio**-2, 0])
+        velocities = half * jnp.array([0, 0, 1 / 2, 0, -1 / (2 * ratio), 0])
+        positions = half**2 * jnp.array([0, 0, 1 / 4, 1 / 2, 1 / 4, 0])
+        piece, x = _locate(lengths[1:-1], jnp.asarray(t, float))
+        w, height, velocity, position = (row[piece] for row in (2 * jnp.pi / lengths, heights, velocities, positions))
+        hump = jnp.sin(w * x / 2) ** 2
+        motion = (
+            position + velocity * x + height * (x**2 / 4 - hump / w**2),
+            velocity + height / 2 * (x - jnp.sin(w * x) / w),
+            height * hump,
+        )
+        q, dq, ddq = (jnp.multiply.outer(values, jnp.asarray(self.amplitude)) for values in motion)
+        return q, dq, ddq
+
+
 def _with_least_jerk(states: Float[Array, "k 3 *n"], durations: Float[Array, "k-1"]) -> Float[Array, "k 3 *n"]:
     """The squared jerk is a quadratic form of all states: its minimum over velocities and accelerations, which have to
     be zero between the ends."""

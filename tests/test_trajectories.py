@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_simpson
 
 from jaximp.simulation.rig import GRAVITY, HUMAN_TRAJECTORY, ROBOT_TRAJECTORY
-from jaximp.trajectories import FourierSeries, MinimumJerk, SixthOrder, at_rest, jerk
+from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 
 SERIES = FourierSeries(sine=[0.4, -1.2, 0.3], cosine=[0.7, 0.1, -0.5], offset=0.2, period=4.0)
 TWO_SERIES = FourierSeries(
@@ -23,6 +24,7 @@ TWO_SERIES = FourierSeries(
 WAY_POINTS = np.array([[0.1, 0.0], [1.0, -0.5], [0.4, 0.2], [0.6, 0.9]])
 DURATIONS = np.array([0.3, 0.2, 0.5])
 IN_MOTION = MinimumJerk([0.1, 0.6], 0.5, end_velocities=[1.0, -2.0], end_accelerations=[3.0, 4.0])
+STATIC_TASK = RaisedSine.of_displacement(0.008, 0.16)
 
 TRAJECTORIES = {
     "series": SERIES,
@@ -30,6 +32,7 @@ TRAJECTORIES = {
     "in motion": IN_MOTION,
     "two chains": MinimumJerk(WAY_POINTS, DURATIONS, end_velocities=[[0.0, 0.2], [0.3, 0.0]]),
     "sixth order": SixthOrder(0.1, 0.6, 0.5),
+    "two raised sines": RaisedSine([1.5, -2.0], 0.16),
 }
 every_trajectory = pytest.mark.parametrize("trajectory", TRAJECTORIES.values(), ids=TRAJECTORIES.keys())
 TIMES = jnp.array([[-0.1, 0.0, 0.03, 0.08, 0.11, 0.16, 0.27, 0.28], [0.3, 0.39, 0.4, 0.5, 0.7, 1.0, 1.3, 4.0]])
@@ -239,6 +242,34 @@ def test_outside_the_motion_rests_or_goes_straight_on() -> None:
     np.testing.assert_allclose([ddq[TIMES == 0.0], ddq[TIMES == 0.5]], [[3.0], [4.0]], atol=1e-12)
 
 
+def test_raised_sine_is_the_profile_of_boerner_2020_and_its_integrals() -> None:
+    def profile(t: np.ndarray, amplitude: float, duration: float) -> np.ndarray:
+        wave = amplitude / 2 * (np.sin(4 * np.pi * t / duration + 3 * np.pi / 2) + 1)
+        return np.where((t < 0) | (t > duration), 0.0, np.where(t < duration / 2, wave, -wave))
+
+    t, step = np.linspace(0.0, 0.5, 50_001, retstep=True)
+    acceleration = profile(t, 2.5, 0.16) + profile(t - 0.16, -4 / 9 * 2.5, 0.24)
+    velocity = cumulative_simpson(acceleration, dx=step, initial=0)
+    q, dq, ddq, _ = motion(STATIC_TASK, t)
+    np.testing.assert_allclose(ddq, acceleration, atol=1e-13)
+    np.testing.assert_allclose(dq, velocity, atol=1e-12)
+    np.testing.assert_allclose(q, cumulative_simpson(velocity, dx=step, initial=0), atol=1e-12)
+
+
+def test_raised_sine_reaches_what_it_is_asked_for_and_returns() -> None:
+    assert STATIC_TASK.amplitude == pytest.approx(2.5, rel=1e-14)
+    static = np.stack(motion(STATIC_TASK, np.append(np.linspace(0.0, 0.4, 5001), [-2.0, 0.4 + 1e-9, 100.0]))[:3])
+    assert np.argmax(static[0]) == 2000
+    assert static[0, 2000] == pytest.approx(0.008, rel=1e-14)
+    np.testing.assert_allclose(static[:, 5000], 0.0, atol=1e-16)
+    np.testing.assert_array_equal(static[:, 5001:], 0.0)
+
+    dynamic_task = RaisedSine.of_force(40 * np.array([0.6, 0.8]), 0.07, inertia=5.0, damping=20.0)
+    dynamic = np.stack(motion(dynamic_task, np.append(np.linspace(0.0, 0.035, 5001), [-0.1, 0.175 + 1e-9]))[:3])
+    np.testing.assert_allclose(np.max(5 * dynamic[2] + 20 * dynamic[1], axis=0), [24.0, 32.0], rtol=1e-6)
+    np.testing.assert_array_equal(dynamic[:, 5001:], 0.0)
+
+
 def test_series_is_periodic() -> None:
     for values, later in zip(TWO_SERIES(TIMES), TWO_SERIES(TIMES + 4.0), strict=True):
         np.testing.assert_allclose(values, later, atol=1e-12)
@@ -257,10 +288,10 @@ def test_trajectories_are_made_inside_compiled_and_batched_functions() -> None:
     @jax.jit
     @jax.vmap
     def halfway(duration: jax.Array) -> list[jax.Array]:
-        made = [MinimumJerk([0, 1], duration), SixthOrder(0, 1, duration)]
+        made = [MinimumJerk([0, 1], duration), SixthOrder(0, 1, duration), RaisedSine.of_displacement(1, duration)]
         return [trajectory(duration / 2)[0] for trajectory in made]
 
-    for positions, expected in zip(halfway(jnp.array([0.1, 2.0])), [0.5, 0.65625], strict=True):
+    for positions, expected in zip(halfway(jnp.array([0.1, 2.0])), [0.5, 0.65625, 0.5], strict=True):
         np.testing.assert_allclose(positions, expected, atol=1e-14)
 
 
@@ -282,6 +313,8 @@ def test_trajectories_are_made_inside_compiled_and_batched_functions() -> None:
         (lambda: MinimumJerk([0, 1], 1, 0, [0, 1, 2]), r"end_accelerations is \(3,\): .* need \(2,\) or one number"),
         (lambda: SixthOrder(0.0, [1.0, 2.0], 1.0), r"start is \(\) and end \(2,\): give both the same joints"),
         (lambda: SixthOrder(0.0, 1.0, -1.0), "duration is -1.0: it must be positive"),
+        (lambda: RaisedSine(1.0, 0.0), "duration is 0.0: it must be positive"),
+        (lambda: RaisedSine(1.0, 0.1, np.nan), "ratio is nan: it must be positive"),
     ],
 )
 def test_wrong_parameters_are_refused(make: Callable[[], Any], message: str) -> None:
