@@ -1,27 +1,37 @@
 """jaximp: mechanical impedance of human joints and arms, and the dynamics of the robots that hold them."""
 
 from jaximp import models
+from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.identify import Estimates, identify, identify_recording
 from jaximp.job import Job, parse_job, read_job
 from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
 from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.recursive import RecursiveFit, recursive_least_squares
-from jaximp.trajectories import FourierSeries
+from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 from jaximp.types import Recording
 from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
 __all__ = [
+    "Design",
+    "Encoder",
     "Estimates",
     "FourierSeries",
     "Job",
+    "Limits",
+    "MinimumJerk",
+    "RaisedSine",
     "Recording",
     "RecursiveFit",
+    "SixthOrder",
     "SlidingFit",
     "WindowFit",
     "adaptive_least_squares",
+    "at_rest",
     "confidence_interval",
+    "design_excitation",
     "identify",
     "identify_recording",
+    "jerk",
     "least_squares",
     "load_recording",
     "models",

@@ -64,6 +64,10 @@ class Model(eqx.Module):
         """Regressor of every sample of a recording; models with memory override it."""
         return self.regressor(q, dq, ddq)
 
+    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
+        """The model with signs of the velocity that change gradually, within some `width` [rad/s or m/s] of zero."""
+        return self
+
     def torque(
         self,
         theta: Num[ArrayLike, " p"],
@@ -100,6 +104,9 @@ class Stacked(Model):
         self.label = ""
         self.n_joints = first.n_joints
 
+    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
+        return _pair_smoothed(self, width)
+
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         return jnp.concatenate([self.first.row(q, dq, ddq), self.second.row(q, dq, ddq)], axis=-1)
 
@@ -127,6 +134,9 @@ class Combined(Model):
         self.label = ""
         self.n_joints = first.n_joints
 
+    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
+        return _pair_smoothed(self, width)
+
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         both = Stacked(self.first, self.second)
         keep = jnp.array([both.columns.index(column) for column in self.columns])
@@ -149,6 +159,11 @@ class Joints(Model):
         self.label = models[0].label
         self.n_joints = len(models)
 
+    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
+        widths = jnp.atleast_1d(jnp.asarray(width))
+        models = tuple(model.smoothed(one) for model, one in zip(self.models, widths, strict=True))
+        return eqx.tree_at(lambda joints: joints.models, self, models)
+
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         if self.n_joints == 1:
             return self.models[0].row(q, dq, ddq)
@@ -159,6 +174,11 @@ class Joints(Model):
 def combine(first: Model, second: Model) -> Combined:
     """Stack two models and merge the columns they share: Tout et al. 2023, eq. (11)."""
     return Combined(first, second)
+
+
+def _pair_smoothed(pair: Model, width: Num[ArrayLike, "*n"]) -> Model:
+    both = pair.first.smoothed(width), pair.second.smoothed(width)  # type: ignore[attr-defined]
+    return eqx.tree_at(lambda pair: (pair.first, pair.second), pair, both)
 
 
 def _check_joints(first: Model, second: Model) -> None:

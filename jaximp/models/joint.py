@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.base import Model
 from jaximp.types import AnyArray
@@ -97,6 +97,8 @@ class RobotJoint(Model):
     gear_ratio: float
     g: float
     joint: str = eqx.field(static=True)
+    width: Array | None
+    """Velocity [rad/s or m/s] around which the sign of it changes, where it is smoothed."""
 
     def __init__(
         self,
@@ -130,6 +132,10 @@ class RobotJoint(Model):
         self.units = tuple(unit[name] for name in self.names)
         self.label = "robot"
         self.n_joints = 1
+        self.width = None
+
+    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
+        return eqx.tree_at(lambda robot: robot.width, self, jnp.asarray(width), is_leaf=lambda x: x is None)
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         sine, cosine = sine_and_cosine(q / self.gear_ratio)
@@ -137,7 +143,7 @@ class RobotJoint(Model):
             "gravity_x": self.g * sine,
             "gravity_y": self.g * cosine,
             "viscous_friction": dq,
-            "coulomb_friction": jnp.sign(dq),
+            "coulomb_friction": jnp.sign(dq) if self.width is None else jnp.tanh(dq / self.width),
             "inertia": ddq,
             "offset_torque": jnp.ones_like(q),
         }

@@ -1,0 +1,600 @@
+"""Exciting trajectories by gradient: what a motion is worth to an estimate, within the limits of joint and robot.
+
+Tout et al. 2023, III-A, after Swevers et al. 1997: the coefficients of a finite Fourier series that make the regressor
+of one period, or of its worst window, as well conditioned as can be. The regressor is differentiable, so the gradient
+is exact, and all starts descend at once.
+
+**Every motion on the way is feasible.** The optimiser's numbers are a direction: the motion starts from rest at its
+offset and goes as far that way as the limits allow. For all limits but the torque's that is a division; the torque's is
+a root, found by bisection and differentiated as an implicit function. Nothing is penalised, no weight is chosen.
+
+**Objectives** see the Gram matrix `W'W` alone, p by p, of the period or of every window. Singular values are roots of
+its eigenvalues, whose derivative is `v' dG v`: exact for distinct values however close, and one of the subgradients
+(that of whichever eigenvectors come out) where they coincide.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaximp.bounds import condition_bound
+from jaximp.engine import cholesky, substitute
+from jaximp.models import Model
+from jaximp.optimise import METHODS, minimise, onto_polytope
+from jaximp.signals import butterworth, central_differences, require_float64
+from jaximp.trajectories import FourierSeries, at_rest, jerk
+from jaximp.types import Progress, nearest
+
+OBJECTIVES = {
+    "condition": "condition number of the regressor",
+    "determinant": "volume of the confidence ellipsoid",
+    "sigma_min": "smallest singular value of the regressor",
+    "stderr": "standard error of one parameter",
+}
+PER_CYCLE = 24
+"""Instants in a period of the highest harmonic at which a motion is judged while it is designed."""
+FINER = 10
+"""The result keeps its limits on a grid that is so many times finer."""
+STAGES = ((0.1, 20.0), (0.01, 200.0))
+"""While a motion is designed, dry friction changes its sign within such a share of the largest velocity, and the worst
+window is a smooth maximum of such sharpness."""
+BISECTIONS = 40
+ROUNDING = 1e-12
+BATCH = 8
+"""Starts that are minimised together; several batches at a time, one on each core."""
+ACTIVE = 0.999
+"""A limit is active where the motion reaches such a share of it."""
+INFEASIBLE = 50.0
+"""Objective where not even rest is allowed: above the logarithm of any condition number."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the motion must keep at every instant: one number for all joints, or one for each."""
+
+    position: tuple[Any, Any] = (-math.inf, math.inf)
+    """Lowest and highest position [rad or m]; both finite, or neither."""
+    velocity: Any = math.inf
+    """Largest speed [rad/s]."""
+    acceleration: Any = math.inf
+    """[rad/s^2]."""
+    jerk: Any = math.inf
+    """[rad/s^3]."""
+    torque: Any = math.inf
+    """Largest torque of the model [N m]; needs the parameters of the model."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """How the motion will be measured, if its quantisation is to be in the loop (Tout et al. 2023, V-A)."""
+
+    step: float
+    """Quantisation step [rad or m]."""
+    sample_rate: float
+    """[Hz]."""
+    cutoff: float
+    """Low-pass of the position before it is differentiated [Hz]."""
+    order: int = 8
+
+
+@dataclass(frozen=True)
+class Design:
+    """A motion that excites a model, and how good it is."""
+
+    trajectory: FourierSeries
+    model: Model
+    condition: float
+    """Condition number of the regressor over one period."""
+    worst_condition: float
+    """That of the worst sliding window, if windows were designed for, else of the period."""
+    lower_bound: float
+    """No motion has a smaller condition number over a period; NaN where no bound is known."""
+    bound_source: str
+    """Where the bound comes from, or why there is none."""
+    period: float
+    """[s]."""
+    objective: str
+    value: float
+    """The objective: a condition number, a singular value, a standard error in units of the torque's noise at
+    `sample_rate` samples per second, or the determinant of the Gram matrix to the power -1/(2p)."""
+    limits: Limits
+    active: tuple[str, ...]
+    """The limits that the motion reaches, in words."""
+    conditions: NDArray[np.float64]
+    """Condition number, over the period or of the worst window, that every start has reached; best first."""
+    parameters: NDArray[np.float64] | None = None
+    """The model's parameters, where they were given."""
+    window: float | None = None
+    """Length of the windows that were designed for [s]."""
+
+    def sampled(self, sample_rate: float) -> dict[str, NDArray[np.float64]]:
+        """One period at a controller's sample rate [Hz]: `time`, `position`, `velocity`, `acceleration` (N, n), and
+        `torque` where the model's parameters are known."""
+        time = np.arange(round(self.period * sample_rate)) / sample_rate
+        q, dq, ddq = (np.asarray(x) for x in self.trajectory(time))
+        found = {"time": time, "position": q, "velocity": dq, "acceleration": ddq}
+        if self.parameters is not None:
+            found["torque"] = np.asarray(self.model.torque(self.parameters, q, dq, ddq))
+        return found
+
+
+class _Problem(eqx.Module):
+    """What is designed, as arrays and static settings."""
+
+    model: Model
+    period: float = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True)
+    rest: bool = eqx.field(static=True)
+    low: Array
+    """(n,) position limits."""
+    high: Array
+    most: Array
+    """(4, n) limits of velocity, acceleration, jerk and torque."""
+    parameters: Array | None
+    scale: Array
+    """(p,) what the columns are multiplied by."""
+    objective: str = eqx.field(static=True)
+    parameter: int = eqx.field(static=True)
+    window: float | None = eqx.field(static=True)
+    """As a share of the period."""
+    encoder: Encoder | None = eqx.field(static=True)
+    samples: float = eqx.field(static=True)
+    """Measurements in one period."""
+
+    @property
+    def n(self) -> int:
+        return self.model.n_joints
+
+    def instants(self, finer: int = 1) -> Array:
+        """Times of one period, evenly spread."""
+        if self.encoder is not None:
+            return jnp.arange(round(self.samples)) / self.encoder.sample_rate
+        count = finer * max(200, PER_CYCLE * self.harmonics)
+        return jnp.arange(count) * (self.period / count)
+
+
+def design_excitation(
+    model: Model,
+    *,
+    harmonics: int = 5,
+    period: float = 10.0,
+    limits: Limits = Limits(),
+    objective: str = "condition",
+    parameter: str | None = None,
+    window: float | None = None,
+    rest: bool = False,
+    scale: Any = None,
+    parameters: Any = None,
+    encoder: Encoder | None = None,
+    sample_rate: float = 1000.0,
+    starts: int = 32,
+    seed: int = 0,
+    method: str = "bfgs",
+    progress: Progress = lambda share: None,
+) -> Design:
+    """Design a periodic motion, a finite Fourier series, that excites every parameter of a model.
+
+    **Arguments:** `harmonics` and `period` [s]: the highest frequency is their ratio. `objective` one of `OBJECTIVES`
+    (`stderr` is that of `parameter`, by its name), over the whole period, or over the worst of all sliding windows of
+    `window` seconds. `rest` makes the period begin and end at rest. `scale` (p,) the size of each parameter: columns
+    are compared by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs.
+    `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
+    error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them.
+
+    **Returns:** a `Design`: the best motion. It keeps the limits on a grid of at least 240 instants in every period of
+    the highest harmonic.
+
+    **Raises:** `ValueError` for limits that no motion can keep (it names them), and for settings that make no sense.
+
+    **Source:** Tout et al. 2023, III-A; the series of Swevers et al. 1997.
+    """
+    require_float64()
+    problem = _problem(
+        model, harmonics, period, limits, objective, parameter, window, rest, scale, parameters, encoder, sample_rate
+    )
+    if method not in METHODS:
+        raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    x = _random_starts(problem, starts, seed)
+    x = _descend(problem, x, method, progress)
+    found = [_judged(problem, one) for one in x]
+    values = np.array([value for _, value, _, _ in found])
+    conditions = np.sort([worst for *_, worst in found])
+    series, value, condition, worst = found[int(np.nanargmin(values))]
+    if not math.isfinite(value):
+        raise ValueError(
+            "no motion of so few harmonics tells all parameters apart: give more harmonics, wider limits, or a smaller "
+            "model"
+        )
+    bound, source = condition_bound(model, harmonics, period)
+    return Design(
+        series, model, condition, worst, bound, source, period, objective, _in_units(problem, value), limits,
+        _active(problem, series), conditions, None if parameters is None else np.asarray(parameters, float), window,
+    )  # fmt: skip
+
+
+def _problem(
+    model: Model,
+    harmonics: int,
+    period: float,
+    limits: Limits,
+    objective: str,
+    parameter: str | None,
+    window: float | None,
+    rest: bool,
+    scale: Any,
+    parameters: Any,
+    encoder: Encoder | None,
+    sample_rate: float,
+) -> _Problem:
+    """The settings, checked."""
+    n, p = model.n_joints, len(model.names)
+    if harmonics < (3 if rest else 1):
+        raise ValueError(f"harmonics is {harmonics}: give at least {3 if rest else 1}")
+    for name, number in (("period", period), ("sample_rate", sample_rate)):
+        if not (math.isfinite(number) and number > 0):
+            raise ValueError(f"{name} is {number}: it must be a number above zero")
+    if objective not in OBJECTIVES:
+        raise ValueError(f"objective is '{objective}': {nearest(objective, list(OBJECTIVES))}")
+    if (objective == "stderr") != (parameter is not None):
+        raise ValueError("the objective 'stderr' needs a parameter, and no other objective takes one")
+    if parameter is not None and parameter not in model.names:
+        raise ValueError(f"parameter is '{parameter}': {nearest(parameter, list(model.names))}")
+    if window is not None and not 0 < window <= period:
+        raise ValueError(f"window is {window:g} s: it must be above zero and no longer than the period of {period:g} s")
+    if encoder is not None and not round(period * encoder.sample_rate) >= 2 * harmonics:
+        raise ValueError("the encoder takes fewer than two samples in a period of the highest harmonic")
+    low, high = (_per_joint(f"limits.position[{k}]", x, n) for k, x in enumerate(limits.position))
+    most = np.stack([_per_joint(f"limits.{name}", getattr(limits, name), n) for name in _SYMMETRIC])
+    if not (np.isfinite(low) == np.isfinite(high)).all():
+        raise ValueError("limits.position is finite on one side only: give both, or neither")
+    if not (low < high).all():
+        raise ValueError(f"limits.position: the lowest, {low.tolist()}, is not below the highest, {high.tolist()}")
+    for name, most_of in zip(_SYMMETRIC, most, strict=True):
+        if not (most_of > 0).all():
+            raise ValueError(f"limits.{name} is {most_of.tolist()}: no motion keeps a limit that is not above zero")
+    if np.isfinite(most[-1]).any() and parameters is None:
+        raise ValueError("limits.torque needs the parameters of the model: pass parameters=...")
+    for name, values in (("parameters", parameters), ("scale", scale)):
+        if values is not None and (np.shape(values) != (p,) or not np.isfinite(values).all()):
+            raise ValueError(f"{name} must be {p} finite numbers, one for each of {', '.join(model.names)}")
+    if scale is not None and not (np.asarray(scale) > 0).all():
+        raise ValueError("scale must be above zero: it is the size of each parameter")
+    return _Problem(
+        model=model,
+        period=float(period),
+        harmonics=harmonics,
+        rest=rest,
+        low=jnp.asarray(low),
+        high=jnp.asarray(high),
+        most=jnp.asarray(most),
+        parameters=None if parameters is None else jnp.asarray(parameters, float),
+        scale=jnp.ones(p) if scale is None else jnp.asarray(scale, float),
+        objective=objective,
+        parameter=-1 if parameter is None else model.names.index(parameter),
+        window=None if window is None else window / period,
+        encoder=encoder,
+        samples=period * (sample_rate if encoder is None else encoder.sample_rate),
+    )
+
+
+_SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
+
+
+def _per_joint(name: str, value: Any, n: int) -> NDArray[np.float64]:
+    given = np.asarray(value, float)
+    if given.shape not in ((), (n,)) or np.isnan(given).any():
+        raise ValueError(f"{name} is {value}: give one number, or one for each of {n} joints")
+    return np.broadcast_to(given, (n,))
+
+
+# The motion that a vector of numbers stands for.
+
+
+def _direction(problem: _Problem, x: Array) -> FourierSeries:
+    """Offsets within their limits, and coefficients as they are."""
+    n, h = problem.n, problem.harmonics
+    middle, half = (problem.high + problem.low) / 2, (problem.high - problem.low) / 2
+    limited = jnp.isfinite(half)
+    offset = jnp.where(limited, jnp.where(limited, middle, 0) + jnp.where(limited, half, 1) * jnp.tanh(x[:n]), x[:n])
+    sine, cosine = x[n:].reshape(2, n, h)
+    series = FourierSeries(sine, cosine, offset, problem.period)
+    return at_rest(series) if problem.rest else series
+
+
+def _times(series: FourierSeries, factor: Array | float) -> FourierSeries:
+    return FourierSeries(series.sine * factor, series.cosine * factor, series.offset, series.period)
+
+
+def _feasible(problem: _Problem, x: Array, t: Array, smooth: Array | None) -> tuple[FourierSeries, Array]:
+    """As far from rest as the limits allow, and how much rest itself exceeds the limit of the torque."""
+    series = _direction(problem, x)
+    series = _times(series, 1 / jnp.maximum(_reached(problem, series, t).max(), 1.0))
+    if problem.parameters is None:
+        return series, jnp.zeros(())
+    return _within_torque(problem, series, t, smooth)
+
+
+def _reached(problem: _Problem, series: FourierSeries, t: Array) -> Array:
+    """(5, n) how far the motion goes, as a share of each limit: up, down, and of velocity, acceleration and jerk."""
+    q, dq, ddq = series(t)
+    swing = q - series.offset
+    up = swing.max(axis=0) / jnp.where(jnp.isfinite(problem.high), problem.high - series.offset, jnp.inf)
+    down = -swing.min(axis=0) / jnp.where(jnp.isfinite(problem.low), series.offset - problem.low, jnp.inf)
+    others = [jnp.abs(x).max(axis=0) / most for x, most in zip((dq, ddq, jerk(series, t)), problem.most, strict=False)]
+    return jnp.stack([up, down, *others])
+
+
+def _within_torque(
+    problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None
+) -> tuple[FourierSeries, Array]:
+    """The largest part of a motion whose torque keeps its limit: a root, differentiated as an implicit function."""
+
+    def excess(factor: Array, series: FourierSeries) -> Array:
+        return _torque_share(problem, _times(series, factor), t, smooth).max() - 1
+
+    fixed = jax.lax.stop_gradient(series)
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) / 2
+        fits = excess(middle, fixed) <= 0
+        return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
+
+    all_of_it = excess(jnp.ones(()), fixed) <= 0
+    root = jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros(()), jnp.ones(())))[0]
+    slope = jax.lax.stop_gradient(jax.grad(excess)(root, fixed))
+    step = excess(root, series) / jnp.where(slope == 0, 1, slope)
+    factor = jnp.where(all_of_it, 1.0, root - (step - jax.lax.stop_gradient(step)))
+    return _times(series, factor), jnp.maximum(excess(jnp.zeros(()), series), 0)
+
+
+def _torque_share(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None) -> Array:
+    """(n,) largest torque as a share of its limit."""
+    assert problem.parameters is not None
+    torque = _rows(problem, series(t), smooth) @ problem.parameters
+    return jnp.abs(torque).max(axis=0) / problem.most[-1]
+
+
+# What a motion is worth.
+
+
+def _rows(problem: _Problem, motion: tuple[Array, ...], smooth: Array | None) -> Array:
+    """(N, n, p) regressor; dry friction changes sign within a share `smooth` of the largest velocity."""
+    q, dq, ddq = motion
+    model, one_joint = problem.model, problem.n == 1
+    if smooth is not None:
+        width = jnp.maximum(smooth * jnp.abs(dq).max(axis=0), jnp.finfo(dq.dtype).eps)  # at rest it would vanish
+        model = model.smoothed(width[0] if one_joint else width)
+    if one_joint:
+        return model.observation_matrix(q[:, 0], dq[:, 0], ddq[:, 0])[:, None]
+    return model.observation_matrix(q, dq, ddq)
+
+
+def _measured(encoder: Encoder, series: FourierSeries, t: Array) -> tuple[Array, ...]:
+    """The motion as it will be estimated from the encoder; its derivatives are those of the motion itself."""
+    from scipy.signal import freqz_sos
+
+    motion = series(t)
+    q = jax.lax.stop_gradient(motion[0])
+    counts = jnp.round(q / encoder.step) * encoder.step
+    sos = butterworth(encoder.order, encoder.cutoff, encoder.sample_rate)
+    gain = np.abs(freqz_sos(sos, np.fft.rfftfreq(len(t)) * 2 * np.pi)[1]) ** 2
+    smooth = jnp.fft.irfft(jnp.fft.rfft(counts, axis=0) * gain[:, None], len(t), axis=0)
+    around = jnp.concatenate([smooth[-1:], smooth, smooth[:1]])  # the motion is periodic
+    dq, ddq = (x[1:-1] for x in central_differences(around, encoder.sample_rate))
+    return tuple(jax.lax.stop_gradient(seen - x) + x for seen, x in zip((smooth, dq, ddq), motion, strict=True))
+
+
+def _grams(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, whole: bool = False) -> Array:
+    """(M, p, p) sums over the period, or over every sliding window, as many as measurements in the same time make."""
+    motion = series(t) if problem.encoder is None else _measured(problem.encoder, series, t)
+    rows = _rows(problem, motion, smooth) * problem.scale
+    products = jnp.einsum("tni,tnj->tij", rows, rows) * (problem.samples / len(t))
+    if problem.window is None or whole:
+        return products.sum(axis=0)[None]
+    length = max(1, round(problem.window * len(t)))
+    stride = max(1, length // 16)
+    # Windows wrap around the end of the period, as the motion does.
+    sums = jnp.cumsum(jnp.concatenate([jnp.zeros_like(products[:1]), products, products[:length]]), axis=0)
+    return sums[length : length + len(t) : stride] - sums[: len(t) : stride]
+
+
+def log_condition(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
+    """Logarithm of the condition number of W, from its Gram matrix."""
+    values = jnp.linalg.eigvalsh(gram)
+    return 0.5 * (jnp.log(values[..., -1]) - jnp.log(jnp.maximum(values[..., 0], jnp.finfo(gram.dtype).tiny)))
+
+
+def log_volume(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
+    """Minus half the logarithm of the determinant of the Gram matrix, per parameter."""
+    p = gram.shape[-1]
+    return -jnp.log(jnp.stack([row[0] for row in _triangle(gram, None)])).sum(axis=0).reshape(gram.shape[:-2]) / p
+
+
+def log_sigma_min(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
+    """Minus the logarithm of the smallest singular value of W."""
+    return -0.5 * jnp.log(jnp.maximum(jnp.linalg.eigvalsh(gram)[..., 0], jnp.finfo(gram.dtype).tiny))
+
+
+def log_stderr(gram: Float[Array, "*M p p"], parameter: int) -> Float[Array, "*M"]:
+    """Logarithm of the standard error of one parameter for torque noise of 1 N m."""
+    p = gram.shape[-1]
+    last = substitute(_triangle(gram, parameter), p)[parameter]
+    return 0.5 * jnp.log(last).reshape(gram.shape[:-2])
+
+
+def _triangle(gram: Array, parameter: int | None) -> tuple[Array, ...]:
+    """Cholesky factors of many small matrices, bordered by a unit vector: written out, as in `engine`."""
+    p = gram.shape[-1]
+    lanes = jnp.moveaxis(gram.reshape(-1, p, p), 0, -1)
+    rows = [lanes[i, i:] for i in range(p)]
+    if parameter is not None:
+        unit = jnp.ones_like(rows[0][:1])
+        rows = [jnp.concatenate([row, unit * (i == parameter)]) for i, row in enumerate(rows)] + [unit]
+    return cholesky(tuple(rows))
+
+
+def _worth(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, sharpness: Array | None) -> Array:
+    """Logarithm of the objective, the smaller the better; of the worst window a smooth maximum."""
+    objectives: dict[str, Callable[[Array], Array]] = {
+        "condition": log_condition,
+        "determinant": log_volume,
+        "sigma_min": log_sigma_min,
+        "stderr": partial(log_stderr, parameter=problem.parameter),
+    }
+    values = objectives[problem.objective](_grams(problem, series, t, smooth))
+    return values.max() if sharpness is None else jax.nn.logsumexp(sharpness * values) / sharpness
+
+
+# Descent.
+
+
+def _random_starts(problem: _Problem, count: int, seed: int) -> Array:
+    """Motions of all shapes, near their limits; where the torque is limited, from rests that keep it."""
+    random, (n, h) = np.random.default_rng(seed), (problem.n, problem.harmonics)
+    if count < 1:
+        raise ValueError(f"starts is {count}: give at least one")
+    spectrum = np.arange(1, h + 1) ** random.uniform(-1, 1, (count, 1, n, 1))
+    coefficients = random.normal(size=(count, 2, n, h)) * spectrum
+    x = np.concatenate([_rests(problem, count, random), coefficients.reshape(count, -1)], axis=1)
+    t = problem.instants()
+    reached = np.asarray(eqx.filter_jit(jax.vmap(lambda x: _reached(problem, _direction(problem, x), t).max()))(x))
+    wanted = np.where(reached > 0, random.uniform(0.5, 1.5, count) / np.where(reached > 0, reached, 1), 1.0)
+    x[:, n:] *= wanted[:, None]
+    return jnp.asarray(x)
+
+
+def _rests(problem: _Problem, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+    x = random.normal(size=(max(count, 4000), problem.n))
+    if problem.parameters is None or not np.isfinite(problem.most[-1]).any():
+        return 0.5 * x[:count]
+    still = np.zeros((len(x), 2 * problem.n * problem.harmonics))
+    t = jnp.zeros(1)
+
+    def share(x: Array) -> Array:
+        return _torque_share(problem, _direction(problem, x), t, None)
+
+    shares = np.asarray(eqx.filter_jit(jax.vmap(share))(jnp.asarray(np.concatenate([x, still], axis=1))))
+    fits = (shares < 1).all(axis=1)
+    if not fits.any():
+        joint = int(shares.min(axis=0).argmax())
+        raise ValueError(
+            f"limits.torque: even at rest joint {joint + 1} needs {shares[:, joint].min():.3g} times the torque that "
+            "is allowed, in every position: raise the limit of the torque, or move those of the position"
+        )
+    return np.resize(x[fits], (count, problem.n))
+
+
+def _descend(problem: _Problem, x: Array, method: str, progress: Progress) -> Array:
+    """All starts, in batches of one size, on as many cores as there are."""
+    polytope = _linear_limits(problem) if method == "projected_gradient" else None
+    batches = [jnp.resize(x[k : k + BATCH], (BATCH, x.shape[1])) for k in range(0, len(x), BATCH)]
+    done = 0
+
+    def descend(batch: Array) -> Array:
+        nonlocal done
+        for smooth, sharpness in STAGES:
+            batch = _stage(problem, batch, jnp.asarray(smooth), jnp.asarray(sharpness), method, polytope)
+            done += 1
+            progress(done / (len(STAGES) * len(batches)))
+        return jax.block_until_ready(batch)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return jnp.concatenate(list(pool.map(descend, batches)))[: len(x)]
+
+
+@eqx.filter_jit
+def _stage(
+    problem: _Problem,
+    x: Array,
+    smooth: Array,
+    sharpness: Array,
+    method: str,
+    polytope: tuple[Array, Array] | None,
+) -> Array:
+    t = problem.instants()
+
+    def objective(x: Array) -> Array:
+        series, excess = _feasible(problem, x, t, smooth)
+        value = _worth(problem, series, t, smooth, sharpness)
+        return jnp.where(excess > 0, INFEASIBLE * (1 + excess), jnp.nan_to_num(value, nan=INFEASIBLE))
+
+    return minimise(objective, x, method, project=None if polytope is None else onto_polytope(*polytope)).x
+
+
+def _linear_limits(problem: _Problem) -> tuple[Array, Array]:
+    """`A x <= b`: the limits that are linear in the coefficients, with the offset in the middle."""
+    t, size = problem.instants(), problem.n * (2 * problem.harmonics + 1)
+
+    def reached(x: Array) -> Array:
+        series = _direction(problem, x)
+        q, dq, ddq = series(t)
+        return jnp.stack([q - series.offset, dq, ddq, jerk(series, t)])
+
+    A = jax.jacobian(reached)(jnp.zeros(size)).reshape(-1, size)
+    room = jnp.stack([(problem.high - problem.low) / 2, *problem.most[:3]])
+    b = jnp.broadcast_to(room[:, None], (4, len(t), problem.n)).ravel()
+    kept = np.isfinite(b)
+    if not kept.any():
+        raise ValueError("projected_gradient needs limits to project onto: give some, or use bfgs")
+    return jnp.concatenate([A[kept], -A[kept]]), jnp.concatenate([b[kept], b[kept]])
+
+
+# The result.
+
+
+def _judged(problem: _Problem, x: Array) -> tuple[FourierSeries, float, float, float]:
+    """The motion on the fine grid, its objective, its condition number over the period and in the worst window."""
+    series, *numbers = _judge(problem, x)
+    single = problem.n == 1
+    sine, cosine, offset = (np.asarray(x) for x in (series.sine, series.cosine, series.offset))
+    if single:
+        sine, cosine, offset = sine[0], cosine[0], offset[0]
+    return FourierSeries(sine, cosine, offset, problem.period), *(float(number) for number in numbers)  # type: ignore[return-value]
+
+
+@eqx.filter_jit
+def _judge(problem: _Problem, x: Array) -> tuple[FourierSeries, Array, Array, Array]:
+    t = problem.instants(FINER)
+    series, _ = _feasible(problem, x, problem.instants(), None)
+    series = _times(series, 1 / jnp.maximum(_reached(problem, series, t).max() * (1 + ROUNDING), 1.0))
+    excess = jnp.zeros(())
+    if problem.parameters is not None:
+        series, excess = _within_torque(problem, series, t, None)
+    value = jnp.where(excess > 0, jnp.inf, _worth(problem, series, t, None, None))
+    plain = eqx.tree_at(lambda p: p.scale, problem, jnp.ones_like(problem.scale))
+    windows = log_condition(_grams(plain, series, t, None))
+    return series, value, jnp.exp(log_condition(_grams(plain, series, t, None, whole=True)))[0], jnp.exp(windows.max())
+
+
+def _in_units(problem: _Problem, value: float) -> float:
+    """The objective as the user knows it."""
+    return math.exp(-value if problem.objective == "sigma_min" else value)
+
+
+def _active(problem: _Problem, series: FourierSeries) -> tuple[str, ...]:
+    """The limits that the motion reaches, in words."""
+    n, t = problem.n, problem.instants(FINER)
+    sine, cosine = (jnp.reshape(x, (n, -1)) for x in (series.sine, series.cosine))
+    several = FourierSeries(sine, cosine, jnp.reshape(series.offset, n), series.period)
+    names = ["highest position", "lowest position", *_SYMMETRIC]
+    reached = list(np.asarray(_reached(problem, several, t)))
+    if problem.parameters is not None:
+        reached.append(np.asarray(_torque_share(problem, several, t, None)))
+    of = [f" of joint {j + 1}" if n > 1 else "" for j in range(n)]
+    return tuple(
+        name + of[j] for name, shares in zip(names, reached, strict=False) for j in range(n) if shares[j] >= ACTIVE
+    )

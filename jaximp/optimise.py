@@ -1,0 +1,113 @@
+"""One face for the optimisers: many starts at a time, minimised in one compiled call.
+
+optimistix is the rule. jaxopt, which is no longer maintained, adds two ways that it lacks; nothing else imports it.
+Which of them is the default for what was measured: experiments/benchmarks/excitation.py.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+Objective = Callable[[Array], Array]
+Projection = Callable[[Array], Array]
+
+METHODS = {
+    "bfgs": "optimistix BFGS",
+    "conjugate_gradient": "optimistix nonlinear conjugate gradient",
+    "lbfgsb": "jaxopt bounded limited-memory BFGS",
+    "projected_gradient": "jaxopt projected gradient; the projection solves a quadratic program",
+}
+
+
+class Found(NamedTuple):
+    """Where each start has led."""
+
+    x: Float[Array, "m d"]
+    value: Float[Array, " m"]
+    steps: Int[Array, " m"]
+
+
+def minimise(
+    objective: Objective,
+    starts: Float[Array, "m d"],
+    method: str = "bfgs",
+    max_steps: int = 500,
+    tolerance: float = 1e-9,
+    bound: float = jnp.inf,
+    project: Projection | None = None,
+) -> Found:
+    """Follow the objective down from every start. Steps that do not converge end after `max_steps`, where they are.
+
+    **Arguments:** `objective` (d,) -> (); `starts` (m, d); `method` one of `METHODS`; `bound` on the size of every
+    number, which `lbfgsb` keeps; `project` (d,) -> (d,) onto a convex set, which `projected_gradient` needs.
+
+    **Raises:** `ValueError` for a method that does not exist, or lacks its projection.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    if method in ("bfgs", "conjugate_gradient"):
+        one = partial(_optimistix, objective, method, max_steps, tolerance)
+    else:
+        one = partial(_jaxopt, objective, method, max_steps, tolerance, bound, project)
+    return jax.vmap(one)(starts)
+
+
+def _optimistix(objective: Objective, method: str, max_steps: int, tolerance: float, start: Array) -> Found:
+    solvers: dict[str, Callable[..., optx.AbstractMinimiser]] = {
+        "bfgs": optx.BFGS,
+        "conjugate_gradient": optx.NonlinearCG,
+    }
+    solver = solvers[method](rtol=tolerance, atol=tolerance)
+    solution: optx.Solution[Array, None] = optx.minimise(
+        lambda x, _: objective(x), solver, start, max_steps=max_steps, throw=False
+    )
+    return Found(solution.value, objective(solution.value), solution.stats["num_steps"])
+
+
+def _jaxopt(
+    objective: Objective,
+    method: str,
+    max_steps: int,
+    tolerance: float,
+    bound: float,
+    project: Projection | None,
+    start: Array,
+) -> Found:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # that it is no longer maintained is known here
+        import jaxopt
+    if method == "lbfgsb":
+        solver = jaxopt.LBFGSB(objective, maxiter=max_steps, tol=tolerance)
+        found, state = solver.run(start, bounds=(jnp.full_like(start, -bound), jnp.full_like(start, bound)))
+    else:
+        if project is None:
+            raise ValueError("projected_gradient needs a projection: there are no linear limits to project onto")
+        solver = jaxopt.ProjectedGradient(
+            objective, lambda x, _: project(x), maxiter=max_steps, tol=tolerance, implicit_diff=False
+        )
+        found, state = solver.run(start)
+    return Found(found, objective(found), state.iter_num)
+
+
+def onto_polytope(A: Float[Array, "k d"], b: Float[Array, " k"]) -> Projection:
+    """Projection onto `A x <= b`, as a quadratic program that is solved by operator splitting (jaxopt's OSQP)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+    d = A.shape[1]
+    solver = jaxopt.BoxOSQP(tol=1e-4, maxiter=200, implicit_diff=False, check_primal_dual_infeasability=False)
+    low = jnp.full_like(b, -jnp.inf)
+
+    def project(x: Array) -> Array:
+        solution = solver.run(params_obj=(jnp.eye(d, dtype=x.dtype), -x), params_eq=A, params_ineq=(low, b))
+        return solution.params.primal[0]
+
+    return project
