@@ -1,4 +1,4 @@
-"""The command line: `jaximp demo | check | identify | simulate | reproduce`."""
+"""The command line: `jaximp demo | check | identify | design | simulate | reproduce`."""
 
 from __future__ import annotations
 
@@ -139,6 +139,29 @@ def check(job_file: JobFile) -> None:
         f"\n# proposed: {proposal.why}\n[filter]\nposition_cutoff = {proposal.position_cutoff:g}\n"
         f"decimation_cutoff = {proposal.decimation_cutoff:g}{window}"
     )
+
+
+@app.command()
+def design(job_file: JobFile, out: Out, force: Force = False) -> None:
+    """Design a motion that excites every parameter, within the limits of joint and robot.
+
+    Writes trajectory.csv, trajectory.json, trajectory.yaml (a ROS JointTrajectory), summary.json and the figure.
+    """
+    from jaximp.design import read_design_job
+    from jaximp.design_files import write_design
+    from jaximp.outputs import new_folder
+
+    job = read_design_job(job_file)
+    with new_folder(out, force, inputs=[job_file]) as folder, _progress("designing") as progress:
+        found = job.run(lambda share: progress(0.9 * share))
+        write_design(folder, found, job.design.sample_rate)
+        from jaximp import plots
+
+        (folder / "trajectory.png").write_bytes(plots.png(plots.design(found)))
+        progress(1.0)
+    for line in found.in_words():
+        typer.echo(line)
+    typer.echo(f"motion: {(out / 'trajectory.csv').resolve()}")
 
 
 @app.command()

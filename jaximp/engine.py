@@ -592,14 +592,19 @@ def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array
 
     def find(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, largest, _ = state
-        diagonal, squares = _tridiagonal(keep(lax.cond(count == 0, gram, inverse_gram)))
-        high = _largest_root(diagonal, squares, _upper_bound(diagonal, squares))
-        low = -_largest_root(-diagonal, squares, jnp.zeros_like(high))
+        low, high = extreme_eigenvalues(keep(lax.cond(count == 0, gram, inverse_gram)))
         return keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, 1 / high)))
 
     nothing = jnp.zeros_like(given[0, 0])
     _, largest, smallest = lax.while_loop(unfinished, find, (jnp.zeros((), int), nothing, nothing))
     return jnp.sqrt(largest), jnp.sqrt(smallest)
+
+
+def extreme_eigenvalues(matrix: Array) -> tuple[Array, Array]:
+    """Smallest and largest eigenvalue of positive semidefinite (p, p, lanes)."""
+    diagonal, squares = _tridiagonal(matrix)
+    high = _largest_root(diagonal, squares, _upper_bound(diagonal, squares))
+    return -_largest_root(-diagonal, squares, jnp.zeros_like(high)), high
 
 
 def _tridiagonal(matrix: Array) -> tuple[Array, Array]:

@@ -34,7 +34,7 @@ from jaximp.regression import (
     windows_in_rows,
 )
 from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
-from jaximp.types import Progress, Recording, nearest
+from jaximp.types import AnyArray, Progress, Recording, nearest
 from jaximp.windows import score, sliding_least_squares
 
 
@@ -121,6 +121,8 @@ class Prepared:
     column_noise: NDArray[np.float64]
     """(p,) what noise of the position leaves in each column."""
     pair: _Pair | None
+    reference: tuple[AnyArray, AnyArray, AnyArray] | str
+    """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
 
 def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
@@ -136,7 +138,10 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
         rows, pair = regress(model, recording, job, filters), None
     else:
         rows, pair = _prepare_pair(job, recording, alone, robot, human, filters)
-    return Prepared(recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair)
+    return Prepared(
+        recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair,
+        _reference(job, recording),
+    )  # fmt: skip
 
 
 def in_windows(
@@ -199,13 +204,20 @@ def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prep
             recording,
             position=recording.position[:, this],
             torque=recording.torque[:, this],
-            reference=None if recording.reference is None else recording.reference[:, this],
             joints=recording.joints[this],
         ),
         model=model,
         rows=Rows(rows.W[:, j, columns], rows.torque[:, j], rows.valid[:, j], rows.time),
         column_noise=prepared.column_noise[columns],
+        reference=_of_joint(prepared.reference, this),
     )
+
+
+def _of_joint(reference: tuple[AnyArray, AnyArray, AnyArray] | str, this: slice) -> tuple[AnyArray, AnyArray, AnyArray] | str:
+    if isinstance(reference, str):
+        return reference
+    q, dq, ddq = (x[:, this] for x in reference)
+    return q, dq, ddq
 
 
 def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
@@ -324,7 +336,7 @@ def _estimates(
         seen = against(starts, place.window, place.step, place.room)
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
-    threshold, why_not = _threshold(job, recording, model, place, method)
+    threshold, why_not = _threshold(job, prepared, place, method)
     verdicts = judge(
         fit,
         model.names,
@@ -374,30 +386,39 @@ def _literal_note(job: Job) -> str:
     )
 
 
-def _threshold(
-    job: Job, recording: Recording, model: Model, place: Placement, method: int | None
-) -> tuple[float | None, str]:
+def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | None) -> tuple[float | None, str]:
     """Threshold of eq. (16), or why it is not applied."""
     if method in (2, 4):
         return None, (
             f"method {method} solves for robot and human together: the threshold for fake changes (eq. 16) of the "
             "human alone does not fit their condition number and is not applied"
         )
+    if isinstance(prepared.reference, str):
+        return None, prepared.reference
+    motion = tuple(x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
+    W = prepared.model.observation_matrix(*motion).reshape(-1, len(prepared.model.names))
+    window = round(job.window.length * prepared.recording.sample_rate * place.counted / place.window)
+    return float(fake_change_threshold(W, len(motion[0]), window)), ""
+
+
+def _reference(job: Job, recording: Recording) -> tuple[AnyArray, AnyArray, AnyArray] | str:
+    """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
+    rate, series = recording.sample_rate, job.load_design()
+    if series is not None:
+        q, dq, ddq = (x.reshape(len(x), -1) for x in series(jnp.arange(round(float(series.period) * rate)) / rate))
+        if q.shape[1] != recording.n_joints:
+            raise ValueError(f"{job.design} moves {q.shape[1]} joints, but the recording has {recording.n_joints}")
+        return q, dq, ddq
     if recording.reference is None or job.reference_period is None:
         missing = "reference position" if recording.reference is None else "reference_period"
-        return None, (
+        return (
             f"no {missing} was given, so the threshold for fake changes (Tout et al. 2023, eq. 16; for periodic "
             "reference motions) is not applied"
         )
-    rate = recording.sample_rate
-    period = round(job.reference_period * rate)
-    reference = recording.reference[:period]
-    if len(reference) < period or not np.isfinite(reference).all():
-        return None, "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
-    dq, ddq = signals.central_differences(reference, rate)
-    motion = tuple(x[:, 0] if recording.n_joints == 1 else x for x in (reference, dq, ddq))
-    W = model.observation_matrix(*motion).reshape(-1, len(model.names))
-    return float(fake_change_threshold(W, period, round(job.window.length * rate * place.counted / place.window))), ""
+    reference = recording.reference[: round(job.reference_period * rate)]
+    if len(reference) < round(job.reference_period * rate) or not np.isfinite(reference).all():
+        return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
+    return reference, *signals.central_differences(reference, rate)
 
 
 def _parameter_scale(rows: Rows) -> NDArray[np.float64]:

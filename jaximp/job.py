@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import math
 import tomllib
-import types
-import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
+from jaximp.design_files import read_trajectory
 from jaximp.models import HumanJoint, Joints, Model, RobotJoint
 from jaximp.payload import METHODS
 from jaximp.recordings import recording_from_mapping
+from jaximp.settings import check_keys, checked, optional, read, settings
+from jaximp.trajectories import FourierSeries
 from jaximp.trust import TrustLimits
-from jaximp.types import Recording, nearest
-
-T = TypeVar("T")
+from jaximp.types import Recording
 
 
 @dataclass(frozen=True)
@@ -106,6 +105,8 @@ class Job:
     """The recording of the robot alone, for the four methods."""
     reference_period: float | None = None
     """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
+    design: str | None = None
+    """The trajectory.json of the design that the motion followed: it serves in place of both."""
     folder: Path = Path()
     """Where relative file names start."""
     text: str = ""
@@ -119,10 +120,15 @@ class Job:
         """The recording of the robot alone, where the job has one."""
         return None if self.robot_recording is None else recording_from_mapping(self.robot_recording, self.folder)
 
+    def load_design(self) -> FourierSeries | None:
+        """The motion that was designed, where the job names one."""
+        return None if self.design is None else read_trajectory(self.folder / self.design)
+
     def files(self) -> list[Path]:
-        """The recordings that the job reads."""
+        """What the job reads."""
         tables = (self.recording, self.robot_recording or {})
-        return [self.folder / str(table["file"]) for table in tables if "file" in table]
+        names = [str(table["file"]) for table in tables if "file" in table]
+        return [self.folder / name for name in (*names, self.design) if name is not None]
 
     def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side."""
@@ -141,23 +147,14 @@ def read_job(path: str | Path) -> Job:
 
     **Raises:** `ValueError` with one line that names the key and the remedy.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        return parse_job(text, path.parent)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: there is no such job file; check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: this is not a TOML file: {error}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return read(path, parse_job)
 
 
 def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
-    known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period"]
-    _check_keys(tables, known, "the job")
+    known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period", "design"]
+    check_keys(tables, known, "the job")
     for required in ("recording", "model", "window"):
         if required not in tables:
             raise ValueError(f"the job has no [{required}] table: add one")
@@ -167,11 +164,12 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     job = Job(
         recording=tables["recording"],
         robot_recording=tables.get("robot_recording"),
-        model=_model(tables["model"]),
-        window=_settings(WindowSettings, tables["window"], "window"),
-        filter=_settings(FilterSettings, tables.get("filter", {}), "filter"),
-        trust=_settings(TrustLimits, tables.get("trust", {}), "trust"),
-        reference_period=_value(tables.get("reference_period"), float | None, "reference_period"),
+        model=model_settings(tables["model"]),
+        window=settings(WindowSettings, tables["window"], "window"),
+        filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
+        trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
+        reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
+        design=checked(tables.get("design"), str | None, "design"),
         folder=folder,
         text=text,
     )
@@ -179,24 +177,17 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     return job
 
 
-def _model(table: Any) -> ModelSettings:
+def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
-    _check_keys(table, ["human", "robot", "methods"], "[model]")
-    robot = _optional(RobotSettings, table.get("robot", False), "model.robot")
-    human = _optional(HumanSettings, table.get("human", False), "model.human")
+    check_keys(table, ["human", "robot", "methods"], "[model]")
+    robot = optional(RobotSettings, table.get("robot", False), "model.robot")
+    human = optional(HumanSettings, table.get("human", False), "model.human")
     methods = table.get("methods", [1])
     methods = methods if isinstance(methods, list) else [methods]
     if not methods or any(type(method) is not int or method not in METHODS for method in methods):
         raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
     return ModelSettings(human, robot, tuple(dict.fromkeys(methods)))
-
-
-def _optional(kind: type[T], value: Any, where: str) -> T | None:
-    """`true` is the model as it comes, a table the model with some settings, `false` none."""
-    if value is False:
-        return None
-    return _settings(kind, {} if value is True else value, where)
 
 
 def _check_values(job: Job) -> None:
@@ -229,6 +220,8 @@ def _check_values(job: Job) -> None:
     for name in ("min_vaf", "min_valid_share"):
         if getattr(job.trust, name) > 1:
             raise ValueError(f"trust.{name} is {getattr(job.trust, name)}: it is a share, between 0 and 1")
+    if job.design is not None and job.reference_period is not None:
+        raise ValueError("design and reference_period both say how long a period is: keep one of them")
     _check_gears(job)
     for name in ("position_order", "decimation_order", "high_pass_order"):
         if not 1 <= getattr(job.filter, name) <= 12:
@@ -250,38 +243,3 @@ def _check_gears(job: Job) -> None:
             "gear_ratio stands both in [recording], which brings the columns to the joint, and in [model], which "
             "expects them at the motor: keep one of them"
         )
-
-
-def _settings(kind: type[T], table: Any, where: str) -> T:
-    """Make a dataclass from a TOML table, with every key and type checked."""
-    if not isinstance(table, dict):
-        raise ValueError(f"[{where}] must be a table")
-    hints = typing.get_type_hints(kind)
-    _check_keys(table, list(hints), f"[{where}]")
-    for setting in fields(kind):  # type: ignore[arg-type]
-        if setting.default is MISSING and setting.name not in table:
-            raise ValueError(f"[{where}] has no '{setting.name}': add it")
-    return kind(**{key: _value(value, hints[key], f"{where}.{key}") for key, value in table.items()})
-
-
-def _value(value: Any, hint: Any, where: str) -> Any:
-    """The value with the type that is wanted: whole numbers pass as floats, nothing else is converted."""
-    if typing.get_origin(hint) is tuple:
-        if isinstance(value, list) and all(type(item) is str for item in value):
-            return tuple(value)
-        raise ValueError(f"{where} is {value!r}: it must be a list of names")
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for choice in choices:
-        if type(value) is choice:
-            return value
-        if choice is float and type(value) is int:
-            return float(value)
-    expected = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): None}
-    names = " or ".join(name for choice in choices if (name := expected[choice]))
-    raise ValueError(f"{where} is {value!r}: it must be {names}")
-
-
-def _check_keys(table: Mapping[str, Any], known: list[str], where: str) -> None:
-    for key in table:
-        if key not in known:
-            raise ValueError(f"{where} has an unknown key '{key}': {nearest(key, known)}")

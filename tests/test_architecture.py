@@ -20,16 +20,19 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("plots",),
     ("identify",),
     ("regression",),
+    ("design",),
     ("job",),
+    ("design_files",),
+    ("excitation",),
     ("payload",),
     ("trust",),
     ("windows", "recursive"),
     ("chunks",),
     ("least_squares", "engine"),
-    ("simulation",),
+    ("simulation", "bounds"),
     ("models",),
     ("recordings", "trajectories"),
-    ("signals", "readers"),
+    ("signals", "readers", "settings", "optimise"),
     ("outputs", "types", "compilation"),
 )
 """From top to bottom; a module imports from strictly lower layers, and a folder from itself."""
@@ -89,7 +92,7 @@ def test_imports_point_down(module: str) -> None:
 
 @every_module
 def test_only_plots_imports_matplotlib(module: str) -> None:
-    if module != "plots":
+    if module.split(".")[0] != "plots":
         assert not [name for name in imports(module) if name.split(".")[0] == "matplotlib"]
 
 

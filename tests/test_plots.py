@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identify import Estimates, identify_recording
 from jaximp.job import parse_job
+from jaximp.plots.style import POINTS, draw_line
 from jaximp.trust import TRUSTED, WEAK, Verdicts
 from jaximp.types import Recording
 
@@ -134,7 +135,7 @@ def test_long_recordings_are_thinned(name: str, estimates: Estimates) -> None:
     lines = [line for panel in figure.axes for line in panel.get_lines()]
     assert lines
     if name != "spectrum":  # its points are frequencies, an eighth of a stretch without a gap
-        assert max(len(line.get_xdata()) for line in lines) <= plots.POINTS
+        assert max(len(line.get_xdata()) for line in lines) <= POINTS
 
 
 def test_still_phase_is_shaded_and_trusted_windows_have_a_band(estimates: Estimates) -> None:
@@ -160,7 +161,7 @@ def test_envelope_keeps_a_spike() -> None:
     y: NDArray[np.float64] = np.zeros(100_000)
     y[54_321] = 7.0
     panel = Figure().subplots()
-    plots._line(panel, np.arange(len(y), dtype=float), y)
+    draw_line(panel, np.arange(len(y), dtype=float), y)
     assert panel.get_lines()[0].get_ydata().max() == 7.0
 
 

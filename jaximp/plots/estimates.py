@@ -1,130 +1,54 @@
-"""Figures of an identification: the only module that draws.
-
-Every function takes results and returns a `Figure` of a printed page's width; `png` renders it. Nothing is kept
-between calls, and the settings of a caller's own matplotlib stay as they are. Long recordings are thinned to
-envelopes, so that a million samples cost as much as a few thousand.
-"""
+"""Figures of an identification: parameters, condition and torque over time, spectra, window lengths, methods."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import wraps
-from io import BytesIO
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator
-from numpy.typing import NDArray
 
 from jaximp.identify import Estimates
 from jaximp.least_squares import confidence_interval
 from jaximp.models.joint import parameter_units
 from jaximp.payload import METHODS
+from jaximp.plots.style import (
+    BLACK,
+    BLUE,
+    HATCH,
+    LINES,
+    PALE,
+    STYLE,
+    VERMILLION,
+    WIDTH,
+    Numbers,
+    bins,
+    cycle,
+    decades,
+    draw_band,
+    draw_line,
+    main_parameter,
+    mean_of,
+    number,
+    remark,
+    styled,
+    with_unit,
+)
 from jaximp.trust import FAKE, NO_DATA, POOR, VERDICTS, WEAK
 
-Numbers = NDArray[np.float64]
-P = ParamSpec("P")
-R = TypeVar("R")
-
-WIDTH = 17 / 2.54
-"""Width of every figure [inch]."""
-POINTS = 4000
-"""A line of more points than this is drawn as its envelope."""
 STRETCHES = 1000
 """Shaded stretches are drawn no finer than this share of the axis."""
 LONG, EXCERPT = 20.0, 5.0
 """A recording longer than the first is shown as its envelope, beside an excerpt of the second [s]."""
 
-# Okabe and Ito: told apart by every kind of colour vision, and by lightness in print.
-BLACK, BLUE, VERMILLION, GREEN, ORANGE = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00"
-PALE, HATCH = "0.55", "0.75"
-LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (ORANGE, ":"), (BLACK, (0, (5, 1, 1, 1, 1, 1))))
 SHADES = {WEAK: ("0.96", "////"), FAKE: ("0.90", "\\\\\\\\"), POOR: ("0.93", "xxxx"), NO_DATA: ("0.98", "....")}
 """Grey and hatch of the stretches that must not be believed."""
 
-STYLE: Any = {
-    "figure.constrained_layout.use": True,
-    "figure.dpi": 150,
-    "font.size": 8.5,
-    "axes.titlesize": 8.5,
-    "axes.labelsize": 8.5,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.fontsize": 8,
-    "legend.frameon": False,
-    "lines.linewidth": 1.2,
-    "lines.markersize": 4.5,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "0.88",
-    "grid.linewidth": 0.5,
-    "hatch.linewidth": 0.4,
-}
 
-
-def _styled(function: Callable[P, R]) -> Callable[P, R]:
-    """Run with the style of these figures, and leave the caller's settings alone."""
-
-    @wraps(function)
-    def with_style(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.rc_context(STYLE):
-            return function(*args, **kwargs)
-
-    return with_style
-
-
-@_styled
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG file.
-
-    Ticks are made while rendering, so that the style is needed here as well. (`savefig` would draw everything twice.)
-    """
-    stream = BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)
-    return stream.getvalue()
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number for people: `6.33×10⁻⁵` where a computer writes 6.33e-05, and a dash where there is none."""
-    if not np.isfinite(value):
-        return "–"
-    mantissa, _, exponent = f"{value:.{digits}g}".replace("-", "−").partition("e")
-    if not exponent:
-        return mantissa
-    return f"{mantissa}×10{str(int(exponent.replace('−', '-'))).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
-
-
-def with_unit(name: str, unit: str) -> str:
-    """A parameter as figures and tables call it, such as `offset torque [N m]`."""
-    return f"{words(name)} [{pretty_unit(unit)}]"
-
-
-def words(name: str) -> str:
-    """The name of a parameter without its underscores."""
-    return name.replace("_", " ").replace(".", " ")
-
-
-def pretty_unit(unit: str) -> str:
-    """A unit with its exponents raised."""
-    return unit.replace("^2", "²")
-
-
-def main_parameter(names: Sequence[str]) -> str:
-    """The parameter that stands for all where only one is shown: the stiffness, else the first."""
-    return next((name for name in names if name.endswith("stiffness")), names[0])
-
-
-@_styled
+@styled
 def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
     """Every parameter in every window, with its confidence interval of the given level."""
     n = len(estimates.names)
@@ -145,25 +69,26 @@ def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def condition_over_time(estimates: Estimates) -> Figure:
     """How well each window determines its parameters, and how well they explain the torque."""
     figure = Figure(figsize=(WIDTH, 5.0))
     condition, smallest, vaf = figure.subplots(3, 1, sharex=True)
-    _line(condition, estimates.end, estimates.fit.cond, color=BLUE)
+    draw_line(condition, estimates.end, estimates.fit.cond, color=BLUE)
     condition.set(ylabel="condition number [1]")
-    _decades(condition, estimates.fit.cond, estimates.threshold)
+    decades(condition, estimates.fit.cond, estimates.threshold)
     if estimates.threshold is None:
-        _remark(condition, "no threshold: it needs a reference position and its period")
+        remark(condition, "no threshold: it needs a reference position and its period")
     else:
         condition.axhline(estimates.threshold, color=VERMILLION, linestyle=":")
-        _remark(condition, "dotted: threshold for fake changes, eq. (16)")
-    _line(smallest, estimates.end, estimates.fit.sigma_min, color=BLUE)
+        remark(condition, "dotted: threshold for fake changes, eq. (16)")
+    draw_line(smallest, estimates.end, estimates.fit.sigma_min, color=BLUE)
     smallest.set(ylabel="smallest singular\nvalue [mixed units]")
-    _decades(smallest, estimates.fit.sigma_min)
-    _line(vaf, estimates.end, estimates.fit.vaf, color=BLUE, label="VAF in the window")
-    _line(vaf, estimates.end, estimates.held_out_vaf, color=VERMILLION, linestyle="--", label="VAF in the next window")
-    lowest = np.percentile(np.append(estimates.held_out_vaf[np.isfinite(estimates.held_out_vaf)], 0.0), 2)
+    decades(smallest, estimates.fit.sigma_min)
+    draw_line(vaf, estimates.end, estimates.fit.vaf, color=BLUE, label="VAF in the window")
+    ahead = estimates.held_out_vaf
+    draw_line(vaf, estimates.end, ahead, color=VERMILLION, linestyle="--", label="VAF in the next window")
+    lowest = np.percentile(np.append(ahead[np.isfinite(ahead)], 0.0), 2)
     vaf.set(ylabel="variance accounted\nfor [1]", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
     vaf.set_xlabel("end of the window [s]")
     for panel in (condition, smallest, vaf):
@@ -173,7 +98,7 @@ def condition_over_time(estimates: Estimates) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def torque(estimates: Estimates) -> Figure:
     """Measured torque against the model's, and what is left: one row per joint, an excerpt beside long recordings."""
     time, n_joints = estimates.time, estimates.torque.shape[1]
@@ -202,7 +127,7 @@ def torque(estimates: Estimates) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def residual_spectrum(estimates: Estimates) -> Figure:
     """Power spectral density (Welch) of the torque and of the residual, on the longest stretch without a gap."""
     n_joints = estimates.torque.shape[1]
@@ -217,7 +142,7 @@ def residual_spectrum(estimates: Estimates) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -> Figure:
     """One parameter of the same data at several window lengths, and what each length costs and earns.
 
@@ -230,9 +155,9 @@ def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -
     figure = Figure(figsize=(WIDTH, 4.4))
     panels = figure.subplot_mosaic([["time", "time"], ["spread", "share"]], height_ratios=(1.1, 1))
     over_time, spread, share = panels["time"], panels["spread"], panels["share"]
-    for (color, style), estimates in zip(_cycle(LINES, len(several)), several, strict=True):
+    for (color, style), estimates in zip(cycle(LINES, len(several)), several, strict=True):
         theta = np.where(estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k], np.nan)
-        _line(over_time, estimates.end, theta, color=color, linestyle=style, label=f"window {estimates.window:g} s")
+        draw_line(over_time, estimates.end, theta, color=color, linestyle=style, label=f"window {estimates.window:g} s")
     whole = min(estimates.end[0] for estimates in several), max(estimates.end[-1] for estimates in several)
     over_time.set(xlabel="end of the window [s]", xlim=whole if whole[0] < whole[1] else None, ylim=_limits(several, k))
     over_time.set_title(f"{with_unit(name, unit)}, trusted windows", loc="left")
@@ -248,7 +173,7 @@ def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -
     return figure
 
 
-@_styled
+@styled
 def methods(several: Sequence[Estimates], parameter: str | None = None) -> Figure:
     """One parameter by several methods, one panel each, all with the same axes."""
     k = several[0].names.index(parameter or main_parameter(several[0].names))
@@ -260,7 +185,7 @@ def methods(several: Sequence[Estimates], parameter: str | None = None) -> Figur
         if estimates.method is not None:
             panel.set_title(f"method {estimates.method}: {METHODS[estimates.method]}", loc="left")
         text, color = _mean_over_trusted(estimates, k)
-        _remark(panel, text, color)
+        remark(panel, text, color)
     figure.supylabel(with_unit(several[0].names[k], several[0].units[k]), fontsize=STYLE["axes.labelsize"])
     panels[-1].set_xlabel("end of the window [s]")
     _legend(figure, panels[int(np.argmax([x.verdicts.trusted.sum() for x in several]))], several)
@@ -275,10 +200,12 @@ def _parameter_panel(
     low, high = (np.where(trusted, end[:, k], np.nan) for end in _interval(estimates, level))
     _shade(panel, estimates)
     if trusted.any():
-        _line(panel, estimates.end, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
-        _band(panel, estimates.end, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
+        draw_line(panel, estimates.end, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
+        draw_band(panel, estimates.end, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
     if not trusted.all():
-        _line(panel, estimates.end, np.clip(theta, *_beyond(limits)), color=PALE, linewidth=0.7, label="not trusted")
+        draw_line(
+            panel, estimates.end, np.clip(theta, *_beyond(limits)), color=PALE, linewidth=0.7, label="not trusted"
+        )
     panel.set_ylim(limits)
 
 
@@ -320,7 +247,7 @@ def _beyond(limits: tuple[float, float]) -> tuple[float, float]:
 def _shade(panel: Axes, estimates: Estimates) -> None:
     """Grey and hatch, one kind per verdict, behind the windows that are not trusted."""
     is_verdict = estimates.verdicts.verdict[:, None] == np.array(VERDICTS)
-    first = _bins(len(is_verdict), STRETCHES)
+    first = bins(len(is_verdict), STRETCHES)
     verdict = np.add.reduceat(is_verdict.astype(int), first).argmax(axis=1)
     end = estimates.end
     half = np.median(np.diff(end)) / 2 if len(end) > 1 else estimates.window / 2
@@ -365,9 +292,9 @@ def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, pa
     time, measured = estimates.time[part], estimates.torque[part, joint]
     seen, unseen = estimates.reconstructed[part, joint], estimates.predicted[part, joint]
     far = _beyond(_torque_limits(estimates, joint))
-    _line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
-    _line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label="model, fitted")
-    _line(
+    draw_line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
+    draw_line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label="model, fitted")
+    draw_line(
         upper,
         time,
         np.clip(unseen, *far),
@@ -376,14 +303,14 @@ def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, pa
         linewidth=0.9,
         label="model, held out (window before)",
     )
-    _line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
-    _line(lower, time, np.clip(measured - unseen, *far), color=VERMILLION, linestyle="--", linewidth=0.9)
+    draw_line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
+    draw_line(lower, time, np.clip(measured - unseen, *far), color=VERMILLION, linestyle="--", linewidth=0.9)
 
 
 def _torque_envelopes(upper: Axes, lower: Axes, estimates: Estimates, joint: int) -> None:
     """Smallest and largest value in every hundredth of the recording: areas for what was measured, and is left."""
     measured = estimates.torque[:, joint]
-    first = _bins(len(measured), 100)
+    first = bins(len(measured), 100)
     time = estimates.time[first]
     far = _beyond(_torque_limits(estimates, joint))
 
@@ -459,7 +386,7 @@ def _spectra(panel: Axes, estimates: Estimates, joint: int) -> None:
     signals, rate = _longest_stretch(estimates, joint)
     n = len(signals[0])
     if n < 16 or np.ptp(signals[0]) == 0:
-        _remark(panel, "no stretch without a gap\nis long enough for a spectrum")
+        remark(panel, "no stretch without a gap\nis long enough for a spectrum")
         panel.set(xticks=(), yticks=())
         return
     what = effort(estimates, joint)[0]
@@ -486,7 +413,7 @@ def _spread_against_error(panel: Axes, length: Numbers, several: Sequence[Estima
 
 def _share_and_held_out(panel: Axes, length: Numbers, several: Sequence[Estimates]) -> None:
     share = [estimates.verdicts.trusted.mean() for estimates in several]
-    held_out = [_mean(estimates.held_out_vaf[estimates.verdicts.trusted]) for estimates in several]
+    held_out = [mean_of(estimates.held_out_vaf[estimates.verdicts.trusted]) for estimates in several]
     panel.plot(length, share, "o-", color=BLUE, label="trusted")
     panel.plot(length, held_out, "s--", color=VERMILLION, label="held-out VAF of these")
     panel.set(ylabel="share of windows, VAF [1]", ylim=(max(-1, np.fmin.reduce(held_out, initial=0.0)) - 0.03, 1.03))
@@ -505,87 +432,3 @@ def effort(estimates: Estimates, joint: int) -> tuple[str, str]:
     units = {u for name, u in zip(estimates.names, estimates.units, strict=True) if not name.startswith("joint")}
     units |= {u for name, u in zip(estimates.names, estimates.units, strict=True) if name.startswith(own)}
     return ("force", "N") if units <= set(parameter_units("prismatic").values()) else ("torque", "N m")
-
-
-def _line(panel: Axes, x: Numbers, y: Any, **style: Any) -> None:
-    """A line, thinned where it is long; the small dots show windows that stand alone."""
-    x, y = np.asarray(x), np.asarray(y, float)
-    if len(x) > POINTS:
-        first = _bins(len(x), POINTS // 2)
-        x = np.repeat(x[first], 2)
-        y = np.column_stack([np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)]).ravel()
-    alone = len(x) <= POINTS and bool(_is_alone(y).any())
-    panel.plot(x, y, marker="." if alone else "", markersize=2, **style)
-
-
-def _is_alone(y: Numbers) -> NDArray[np.bool_]:
-    """Points between two gaps, which a line does not show."""
-    counts = np.isfinite(y)
-    return counts & ~np.append(False, counts[:-1]) & ~np.append(counts[1:], False)
-
-
-def _band(panel: Axes, x: Numbers, low: Numbers, high: Numbers, **style: Any) -> None:
-    first = _bins(len(x), POINTS // 2)
-    panel.fill_between(x[first], np.fmin.reduceat(low, first), np.fmax.reduceat(high, first), **style)
-
-
-def _bins(n: int, limit: int) -> NDArray[np.int64]:
-    """First index of each of at most `limit` equal groups of n values."""
-    return np.linspace(0, n, min(n, limit), endpoint=False).astype(np.int64)
-
-
-def _cycle(items: Sequence[R], n: int) -> list[R]:
-    return [items[k % len(items)] for k in range(n)]
-
-
-def _mean(values: Numbers) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else float("nan")
-
-
-def _decades(panel: Axes, values: Any, *others: float | None) -> None:
-    """A logarithmic axis over whole decades, so that noise does not look like a change."""
-    shown = np.append(np.asarray(values, float), [other for other in others if other is not None])
-    shown = shown[np.isfinite(shown) & (shown > 0)].clip(1e-16, 1e16)  # beyond, it is rounding
-    panel.set_yscale("log")
-    if len(shown):
-        low, high = np.log10(shown.min()), np.log10(shown.max())
-        panel.set_ylim(10 ** np.floor(low - 0.1), 10 ** np.ceil(high + 0.1))
-    panel.minorticks_off()
-
-
-def _remark(panel: Axes, text: str, color: str = "0.3") -> None:
-    """A few words in the upper left corner, readable on any shade."""
-    frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
-    panel.text(0.01, 0.95, text, transform=panel.transAxes, va="top", color=color, bbox=frame, zorder=5)
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A set of curves in one pair of axes."""
-
-    title: str
-    x: str
-    y: str
-    lines: Sequence[tuple[str, Numbers, Numbers]]
-    """Label, x and y of each; the first is drawn in black, as what the others are held against."""
-    limits: tuple[float, float] | None = None
-    log: bool = False
-
-
-@_styled
-def curves(panels: Sequence[Panel]) -> Figure:
-    """Panels one below another, each with its legend beside it."""
-    figure = Figure(figsize=(WIDTH, 2.2 * len(panels) + 0.3))
-    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
-    for axis, panel in zip(axes, panels, strict=True):
-        for k, (label, x, y) in enumerate(panel.lines):
-            color, style = (BLACK, "-") if k == 0 else LINES[:4][(k - 1) % 4]
-            _line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if k else 1.3)
-        if panel.limits is not None:
-            axis.set_ylim(*panel.limits)
-        if panel.log:
-            axis.set_yscale("log")
-        axis.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
-        axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    return figure

@@ -1,0 +1,37 @@
+"""Figures: the only part that draws.
+
+Every function takes results and returns a `Figure` of a printed page's width; `png` renders it. Nothing is kept
+between calls, and the settings of a caller's own matplotlib stay as they are. Long recordings are thinned to
+envelopes, so that a million samples cost as much as a few thousand.
+"""
+
+from jaximp.plots.design import design
+from jaximp.plots.estimates import (
+    condition_over_time,
+    effort,
+    methods,
+    parameters_over_time,
+    residual_spectrum,
+    torque,
+    window_lengths,
+)
+from jaximp.plots.style import Panel, curves, main_parameter, number, png, pretty_unit, with_unit, words
+
+__all__ = [
+    "Panel",
+    "condition_over_time",
+    "curves",
+    "design",
+    "effort",
+    "main_parameter",
+    "methods",
+    "number",
+    "parameters_over_time",
+    "png",
+    "pretty_unit",
+    "residual_spectrum",
+    "torque",
+    "window_lengths",
+    "with_unit",
+    "words",
+]

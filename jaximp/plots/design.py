@@ -1,0 +1,78 @@
+"""Figure of a designed motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaximp.excitation import Design
+from jaximp.plots.style import BLACK, LINES, WIDTH, Numbers, draw_line, styled
+from jaximp.trajectories import FourierSeries
+
+UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
+
+
+@styled
+def design(found: Design) -> Figure:
+    """A designed motion with its limits, its spectrum, and the condition number over sliding windows."""
+    n, series = found.model.n_joints, found.trajectory
+    motion = found.sampled(max(200.0, 40 * float(series.highest_frequency)))
+    names = [name for name in ("position", "velocity", "acceleration", "torque") if name in motion]
+    figure = Figure(figsize=(WIDTH, 1.5 * len(names) + 4.2))
+    *axes, spectrum, condition = figure.subplots(len(names) + 2, 1)
+    for axis, name in zip(axes, names, strict=True):
+        for j, x in enumerate(motion[name].reshape(len(motion["time"]), n).T):
+            color, style = LINES[j % len(LINES)]
+            draw_line(axis, motion["time"], x, color=color, linestyle=style, label=f"joint {j + 1}")
+        limit = getattr(found.limits, name)
+        ends = limit if name == "position" else (-np.asarray(limit), np.asarray(limit))
+        for value in np.unique([np.ravel(end) for end in np.broadcast_arrays(*ends)]):
+            if np.isfinite(value):
+                axis.axhline(value, color=BLACK, linestyle=":", linewidth=0.8)
+        axis.set(ylabel=f"{name}\n[{UNITS[name]}]", xlim=(0, found.period))
+        axis.tick_params(labelbottom=axis is axes[-1])
+    axes[0].set_title(f"One period; dotted: limits. Reached: {', '.join(found.active) or 'none'}")
+    axes[-1].set_xlabel("time [s]")
+    if n > 1:
+        axes[0].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    _harmonics(spectrum, series)
+    _sliding_condition(condition, found, motion)
+    return figure
+
+
+def _harmonics(panel: Axes, series: FourierSeries) -> None:
+    amplitude = np.atleast_2d(np.hypot(series.sine, series.cosine))
+    count, period = amplitude.shape[1], float(series.period)
+    frequency = np.arange(1, count + 1) / period
+    width = 0.8 / len(amplitude) / period
+    for j, row in enumerate(amplitude):
+        panel.bar(frequency + (j - (len(amplitude) - 1) / 2) * width, row, width, color=LINES[j % len(LINES)][0])
+    panel.set(
+        title="Amplitude of the velocity", xlabel="frequency [Hz]", ylabel="[rad/s]", xlim=(0, (count + 1) / period)
+    )
+
+
+def _sliding_condition(panel: Axes, found: Design, motion: dict[str, Numbers]) -> None:
+    """Condition number of the window that ends at each time; the motion is periodic, and so are windows."""
+    rows = np.asarray(
+        found.model.observation_matrix(*(motion[name] for name in ("position", "velocity", "acceleration")))
+    )
+    products = np.einsum("tni,tnj->tij", *[rows.reshape(len(rows), found.model.n_joints, -1)] * 2)
+    sums = np.cumsum(np.concatenate([np.zeros_like(products[:1]), products, products]), axis=0)
+    lengths = [found.window] if found.window else [found.period / 10, found.period / 5, found.period / 2]
+    for k, length in enumerate(lengths):
+        n = max(1, round(length / found.period * len(rows)))
+        values = np.linalg.eigvalsh(sums[len(rows) + 1 :] - sums[len(rows) + 1 - n : len(sums) - n])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cond = np.sqrt(values[:, -1] / np.where(values[:, 0] > 1e-14 * values[:, -1], values[:, 0], np.nan))
+        color, style = LINES[k % len(LINES)]
+        draw_line(panel, motion["time"], cond, color=color, linestyle=style, label=f"{length:g} s")
+    panel.axhline(found.condition, color=BLACK, linewidth=0.8, label="whole period")
+    panel.set(
+        title="Condition number of sliding windows",
+        xlabel="end of the window [s]",
+        xlim=(0, found.period),
+        yscale="log",
+    )
+    panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))

@@ -1,0 +1,186 @@
+"""What all figures share: their style, lines and bands for long signals, words and numbers for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from io import BytesIO
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+Numbers = NDArray[np.float64]
+P = ParamSpec("P")
+R = TypeVar("R")
+
+WIDTH = 17 / 2.54
+"""Width of every figure [inch]."""
+POINTS = 4000
+"""A line of more points than this is drawn as its envelope."""
+# Okabe and Ito: told apart by every kind of colour vision, and by lightness in print.
+BLACK, BLUE, VERMILLION, GREEN, ORANGE = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00"
+PALE, HATCH = "0.55", "0.75"
+LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (ORANGE, ":"), (BLACK, (0, (5, 1, 1, 1, 1, 1))))
+STYLE: Any = {
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 150,
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.5,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.5,
+    "hatch.linewidth": 0.4,
+}
+
+
+def styled(function: Callable[P, R]) -> Callable[P, R]:
+    """Run with the style of these figures, and leave the caller's settings alone."""
+
+    @wraps(function)
+    def with_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(STYLE):
+            return function(*args, **kwargs)
+
+    return with_style
+
+
+@styled
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file.
+
+    Ticks are made while rendering, so that the style is needed here as well. (`savefig` would draw everything twice.)
+    """
+    stream = BytesIO()
+    FigureCanvasAgg(figure).print_png(stream)
+    return stream.getvalue()
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people: `6.33×10⁻⁵` where a computer writes 6.33e-05, and a dash where there is none."""
+    if not np.isfinite(value):
+        return "–"
+    mantissa, _, exponent = f"{value:.{digits}g}".replace("-", "−").partition("e")
+    if not exponent:
+        return mantissa
+    return f"{mantissa}×10{str(int(exponent.replace('−', '-'))).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A parameter as figures and tables call it, such as `offset torque [N m]`."""
+    return f"{words(name)} [{pretty_unit(unit)}]"
+
+
+def words(name: str) -> str:
+    """The name of a parameter without its underscores."""
+    return name.replace("_", " ").replace(".", " ")
+
+
+def pretty_unit(unit: str) -> str:
+    """A unit with its exponents raised."""
+    return unit.replace("^2", "²")
+
+
+def main_parameter(names: Sequence[str]) -> str:
+    """The parameter that stands for all where only one is shown: the stiffness, else the first."""
+    return next((name for name in names if name.endswith("stiffness")), names[0])
+
+
+def draw_line(panel: Axes, x: Numbers, y: Any, **style: Any) -> None:
+    """A line, thinned where it is long; the small dots show windows that stand alone."""
+    x, y = np.asarray(x), np.asarray(y, float)
+    if len(x) > POINTS:
+        first = bins(len(x), POINTS // 2)
+        x = np.repeat(x[first], 2)
+        y = np.column_stack([np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)]).ravel()
+    alone = len(x) <= POINTS and bool(_is_alone(y).any())
+    panel.plot(x, y, marker="." if alone else "", markersize=2, **style)
+
+
+def _is_alone(y: Numbers) -> NDArray[np.bool_]:
+    """Points between two gaps, which a line does not show."""
+    counts = np.isfinite(y)
+    return counts & ~np.append(False, counts[:-1]) & ~np.append(counts[1:], False)
+
+
+def draw_band(panel: Axes, x: Numbers, low: Numbers, high: Numbers, **style: Any) -> None:
+    first = bins(len(x), POINTS // 2)
+    panel.fill_between(x[first], np.fmin.reduceat(low, first), np.fmax.reduceat(high, first), **style)
+
+
+def bins(n: int, limit: int) -> NDArray[np.int64]:
+    """First index of each of at most `limit` equal groups of n values."""
+    return np.linspace(0, n, min(n, limit), endpoint=False).astype(np.int64)
+
+
+def cycle(items: Sequence[R], n: int) -> list[R]:
+    return [items[k % len(items)] for k in range(n)]
+
+
+def mean_of(values: Numbers) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def decades(panel: Axes, values: Any, *others: float | None) -> None:
+    """A logarithmic axis over whole decades, so that noise does not look like a change."""
+    shown = np.append(np.asarray(values, float), [other for other in others if other is not None])
+    shown = shown[np.isfinite(shown) & (shown > 0)].clip(1e-16, 1e16)  # beyond, it is rounding
+    panel.set_yscale("log")
+    if len(shown):
+        low, high = np.log10(shown.min()), np.log10(shown.max())
+        panel.set_ylim(10 ** np.floor(low - 0.1), 10 ** np.ceil(high + 0.1))
+    panel.minorticks_off()
+
+
+def remark(panel: Axes, text: str, color: str = "0.3") -> None:
+    """A few words in the upper left corner, readable on any shade."""
+    frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
+    panel.text(0.01, 0.95, text, transform=panel.transAxes, va="top", color=color, bbox=frame, zorder=5)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A set of curves in one pair of axes."""
+
+    title: str
+    x: str
+    y: str
+    lines: Sequence[tuple[str, Numbers, Numbers]]
+    """Label, x and y of each; the first is drawn in black, as what the others are held against."""
+    limits: tuple[float, float] | None = None
+    log: bool = False
+
+
+@styled
+def curves(panels: Sequence[Panel]) -> Figure:
+    """Panels one below another, each with its legend beside it."""
+    figure = Figure(figsize=(WIDTH, 2.2 * len(panels) + 0.3))
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        for k, (label, x, y) in enumerate(panel.lines):
+            color, style = (BLACK, "-") if k == 0 else LINES[:4][(k - 1) % 4]
+            draw_line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if k else 1.3)
+        if panel.limits is not None:
+            axis.set_ylim(*panel.limits)
+        if panel.log:
+            axis.set_yscale("log")
+        axis.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
+        axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure
