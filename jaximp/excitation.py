@@ -363,7 +363,7 @@ def _within_torque(
 
     fixed = jax.lax.stop_gradient(series)
 
-    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) / 2
         fits = excess(middle, fixed) <= 0

@@ -37,6 +37,9 @@ from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest
 from jaximp.windows import score, sliding_least_squares
 
+ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
+"""Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
+
 
 @dataclass(frozen=True)
 class Estimates:
@@ -121,8 +124,7 @@ class Prepared:
     column_noise: NDArray[np.float64]
     """(p,) what noise of the position leaves in each column."""
     pair: _Pair | None
-    reference: tuple[AnyArray, AnyArray, AnyArray] | str
-    """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
+    reference: ReferenceMotion
 
 
 def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
@@ -213,7 +215,7 @@ def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prep
     )
 
 
-def _of_joint(reference: tuple[AnyArray, AnyArray, AnyArray] | str, this: slice) -> tuple[AnyArray, AnyArray, AnyArray] | str:
+def _of_joint(reference: ReferenceMotion, this: slice) -> ReferenceMotion:
     if isinstance(reference, str):
         return reference
     q, dq, ddq = (x[:, this] for x in reference)
@@ -401,7 +403,7 @@ def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | Non
     return float(fake_change_threshold(W, len(motion[0]), window)), ""
 
 
-def _reference(job: Job, recording: Recording) -> tuple[AnyArray, AnyArray, AnyArray] | str:
+def _reference(job: Job, recording: Recording) -> ReferenceMotion:
     """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
     rate, series = recording.sample_rate, job.load_design()
     if series is not None:
