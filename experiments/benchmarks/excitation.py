@@ -81,7 +81,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
             f"{best['robot']['best']:.1f}, in {best['robot']['second_s']:.1f} s",
         ),
         (
-            "worst window of 2 s, human joint, order 7 (whole period: 11.6)",
+            "worst window of 2 s, human joint, order 7, mean position free (whole period: 11.6)",
             "3.8",
             f"{best['worst window']['best']:.2f}, in {best['worst window']['second_s']:.1f} s",
         ),
