@@ -32,6 +32,8 @@ class DesignSettings:
     """Design for the worst sliding window of this length [s], not for the whole period."""
     rest: bool = False
     """Begin and end at rest."""
+    mean: float | list[float] | None = None
+    """Mean position [rad or m], for all joints or for each; free where it is not given."""
     sample_rate: float = 1000.0
     """Of the controller, and of the exported motion [Hz]."""
     joints: int = 1
@@ -67,30 +69,27 @@ class DesignJob:
 
     def run(self, progress: Progress = lambda share: None) -> Design:
         """Design the motion."""
-        settings = dict(vars(self.design))
-        n = settings.pop("joints")
-        model = self.onemodel_settings(n)
-        encoder = None if self.encoder is None else Encoder(sample_rate=self.design.sample_rate, **vars(self.encoder))
-        parameters, scale = (
-            _by_name(x, model, name) for name, x in (("parameters", self.parameters), ("scale", self.scale))
-        )
+        wanted = dict(vars(self.design))
+        model = self._made(joints=wanted.pop("joints"))
         return design_excitation(
             model,
             limits=self.limits,
-            parameters=parameters,
-            scale=scale,
-            encoder=encoder,
+            parameters=_by_name(self.parameters, model, "parameters"),
+            scale=_by_name(self.scale, model, "scale"),
+            encoder=None
+            if self.encoder is None
+            else Encoder(sample_rate=self.design.sample_rate, **vars(self.encoder)),
             progress=progress,
-            **settings,
+            **wanted,
         )
 
-    def onemodel_settings(self, n: int) -> Model:
+    def _made(self, joints: int) -> Model:
         """Robot, human, or both with the columns that they share merged; joints side by side."""
         robot, human = self.model.robot, self.model.human
         made: list[Model] = [] if robot is None else [RobotJoint(**vars(robot))]
         made += [] if human is None else [HumanJoint(**vars(human))]
         one = made[0] if len(made) == 1 else combine(*made)
-        return one if n == 1 else Joints(*[one] * n)
+        return one if joints == 1 else Joints(*[one] * joints)
 
 
 def _by_name(values: Mapping[str, float] | None, model: Model, where: str) -> list[float] | None:

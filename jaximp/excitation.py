@@ -36,7 +36,7 @@ from jaximp.models import Model
 from jaximp.optimise import METHODS, minimise, onto_polytope
 from jaximp.signals import butterworth, central_differences, require_float64
 from jaximp.trajectories import FourierSeries, at_rest, jerk
-from jaximp.types import Progress, nearest
+from jaximp.types import AnyArray, Progress, nearest
 
 OBJECTIVES = {
     "condition": "condition number of the regressor",
@@ -136,6 +136,24 @@ class Design:
         lines.append("limits reached: " + (", ".join(self.active) or "none"))
         return lines
 
+    def sliding_condition(self, length: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Condition number of the regressor in every window of `length` seconds.
+
+        **Returns:** the end of each window (M,) [s], evenly spread over one period, and its condition number (M,),
+        infinite where the window does not determine the parameters. Windows that reach back beyond the beginning of
+        the period see the end of the one before.
+        """
+        count = max(400, 4 * PER_CYCLE * np.shape(self.trajectory.sine)[-1])
+        motion = self.sampled(count / self.period)
+        rows = self.model.observation_matrix(*(motion[name] for name in ("position", "velocity", "acceleration")))
+        products = np.einsum("tni,tnj->tij", *[np.asarray(rows).reshape(count, self.model.n_joints, -1)] * 2)
+        n = min(count, max(1, round(length / self.period * count)))
+        values = np.linalg.eigvalsh(_sliding_sums(products, n))
+        low, high = np.maximum(values[:, 0], 0), values[:, -1]
+        known = low > np.finfo(float).eps * high
+        cond = np.sqrt(np.divide(high, low, out=np.full(count, np.inf), where=known))
+        return motion["time"], np.roll(cond, n - 1)
+
     def sampled(self, sample_rate: float) -> dict[str, NDArray[np.float64]]:
         """One period at a controller's sample rate [Hz]: `time`, `position`, `velocity`, `acceleration` (N, n), and
         `torque` where the model's parameters are known."""
@@ -162,6 +180,8 @@ class _Problem(eqx.Module):
     parameters: Array | None
     scale: Array
     """(p,) what the columns are multiplied by."""
+    mean: Array | None
+    """(n,) mean position, where it is given."""
     objective: str = eqx.field(static=True)
     parameter: int = eqx.field(static=True)
     window: float | None = eqx.field(static=True)
@@ -192,6 +212,7 @@ def design_excitation(
     parameter: str | None = None,
     window: float | None = None,
     rest: bool = False,
+    mean: Any = None,
     scale: Any = None,
     parameters: Any = None,
     encoder: Encoder | None = None,
@@ -205,8 +226,9 @@ def design_excitation(
 
     **Arguments:** `harmonics` and `period` [s]: the highest frequency is their ratio. `objective` one of `OBJECTIVES`
     (`stderr` is that of `parameter`, by its name), over the whole period, or over the worst of all sliding windows of
-    `window` seconds. `rest` makes the period begin and end at rest. `scale` (p,) the size of each parameter: columns
-    are compared by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs.
+    `window` seconds. `rest` makes the period begin and end at rest. `mean` position [rad or m], for all joints or for
+    each; where it is not given, it is designed as well. `scale` (p,) the size of each parameter: columns are compared
+    by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs.
     `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
     error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them.
 
@@ -219,7 +241,19 @@ def design_excitation(
     """
     require_float64()
     problem = _problem(
-        model, harmonics, period, limits, objective, parameter, window, rest, scale, parameters, encoder, sample_rate
+        model,
+        harmonics,
+        period,
+        limits,
+        objective,
+        parameter,
+        window,
+        rest,
+        mean,
+        scale,
+        parameters,
+        encoder,
+        sample_rate,
     )
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
@@ -250,6 +284,7 @@ def _problem(
     parameter: str | None,
     window: float | None,
     rest: bool,
+    mean: Any,
     scale: Any,
     parameters: Any,
     encoder: Encoder | None,
@@ -278,6 +313,10 @@ def _problem(
         raise ValueError("limits.position is finite on one side only: give both, or neither")
     if not (low < high).all():
         raise ValueError(f"limits.position: the lowest, {low.tolist()}, is not below the highest, {high.tolist()}")
+    if mean is not None:
+        mean = _per_joint("mean", mean, n)
+        if not ((low < mean) & (mean < high)).all():
+            raise ValueError(f"mean is {mean.tolist()}: it must be inside limits.position")
     for name, most_of in zip(_SYMMETRIC, most, strict=True):
         if not (most_of > 0).all():
             raise ValueError(f"limits.{name} is {most_of.tolist()}: no motion keeps a limit that is not above zero")
@@ -298,6 +337,7 @@ def _problem(
         most=jnp.asarray(most),
         parameters=None if parameters is None else jnp.asarray(parameters, float),
         scale=jnp.ones(p) if scale is None else jnp.asarray(scale, float),
+        mean=None if mean is None else jnp.asarray(mean),
         objective=objective,
         parameter=-1 if parameter is None else model.names.index(parameter),
         window=None if window is None else window / period,
@@ -322,9 +362,12 @@ def _per_joint(name: str, value: Any, n: int) -> NDArray[np.float64]:
 def _direction(problem: _Problem, x: Array) -> FourierSeries:
     """Offsets within their limits, and coefficients as they are."""
     n, h = problem.n, problem.harmonics
-    middle, half = (problem.high + problem.low) / 2, (problem.high - problem.low) / 2
-    limited = jnp.isfinite(half)
-    offset = jnp.where(limited, jnp.where(limited, middle, 0) + jnp.where(limited, half, 1) * jnp.tanh(x[:n]), x[:n])
+    offset = problem.mean
+    if offset is None:
+        middle, half = (problem.high + problem.low) / 2, (problem.high - problem.low) / 2
+        limited = jnp.isfinite(half)
+        inside = jnp.where(limited, middle, 0) + jnp.where(limited, half, 1) * jnp.tanh(x[:n])
+        offset = jnp.where(limited, inside, x[:n])
     sine, cosine = x[n:].reshape(2, n, h)
     series = FourierSeries(sine, cosine, offset, problem.period)
     return at_rest(series) if problem.rest else series
@@ -422,10 +465,14 @@ def _grams(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | N
     if problem.window is None or whole:
         return products.sum(axis=0)[None]
     length = max(1, round(problem.window * len(t)))
-    stride = max(1, length // 16)
-    # Windows wrap around the end of the period, as the motion does.
+    return _sliding_sums(products, length)[:: max(1, length // 16)]
+
+
+def _sliding_sums(products: AnyArray, length: int) -> Array:
+    """Sums over the windows of `length` instants that begin at each instant; they wrap around, as the motion does."""
+    products = jnp.asarray(products)
     sums = jnp.cumsum(jnp.concatenate([jnp.zeros_like(products[:1]), products, products[:length]]), axis=0)
-    return sums[length : length + len(t) : stride] - sums[: len(t) : stride]
+    return sums[length : length + len(products)] - sums[: len(products)]
 
 
 @jax.custom_jvp

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import partial
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -81,9 +82,7 @@ def _jaxopt(
     project: Projection | None,
     start: Array,
 ) -> Found:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # that it is no longer maintained is known here
-        import jaxopt
+    jaxopt = _imported_jaxopt()
     if method == "lbfgsb":
         solver = jaxopt.LBFGSB(objective, maxiter=max_steps, tol=tolerance)
         found, state = solver.run(start, bounds=(jnp.full_like(start, -bound), jnp.full_like(start, bound)))
@@ -99,11 +98,10 @@ def _jaxopt(
 
 def onto_polytope(A: Float[Array, "k d"], b: Float[Array, " k"]) -> Projection:
     """Projection onto `A x <= b`, as a quadratic program that is solved by operator splitting (jaxopt's OSQP)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        import jaxopt
     d = A.shape[1]
-    solver = jaxopt.BoxOSQP(tol=1e-4, maxiter=200, implicit_diff=False, check_primal_dual_infeasability=False)
+    solver = _imported_jaxopt().BoxOSQP(
+        tol=1e-4, maxiter=200, implicit_diff=False, check_primal_dual_infeasability=False
+    )
     low = jnp.full_like(b, -jnp.inf)
 
     def project(x: Array) -> Array:
@@ -111,3 +109,11 @@ def onto_polytope(A: Float[Array, "k d"], b: Float[Array, " k"]) -> Projection:
         return solution.params.primal[0]
 
     return project
+
+
+def _imported_jaxopt() -> ModuleType:
+    """It warns that it is no longer maintained, which is known here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+    return jaxopt

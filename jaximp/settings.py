@@ -54,11 +54,20 @@ def checked(value: Any, hint: Any, where: str) -> Any:
         raise ValueError(f"{where} is {value!r}: it must be a list of names")
     choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for choice in choices:
+        if choice == list[float] and isinstance(value, list):
+            return [checked(item, float, where) for item in value]
         if type(value) is choice:
             return value
         if choice is float and type(value) is int:
             return float(value)
-    expected = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): None}
+    expected: dict[Any, str | None] = {
+        float: "a number",
+        list[float]: "a list of numbers",
+        int: "a whole number",
+        bool: "true or false",
+        str: "text",
+        type(None): None,
+    }
     names = " or ".join(name for choice in choices if (name := expected[choice]))
     raise ValueError(f"{where} is {value!r}: it must be {names}")
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from jaximp.chunks import (
     Piece,
+    Task,
     lags_for_sums,
     make_adaptive_task,
     make_task,
@@ -195,8 +196,7 @@ def adaptive_least_squares(
     lengths = np.unique(np.geomspace(few, most, count).round().astype(int))
     noise = _noise_in_sums(noise, shortest, n, "a fixed window")
     task = make_adaptive_task(lengths, step * n, n, stderr, np.asarray(cond, W.dtype), noise, scale.dtype != bool)
-    found = solve_traced(_rows(W, y, scale), task) if _traced(W, y, scale) else solve_all(_as_piece(W, y, scale), task)
-    return jax.tree.map(lambda x: x[few - 1 :], found)
+    return jax.tree.map(lambda x: x[few - 1 :], _from_shared_sums(W, y, scale, task))
 
 
 def in_samples(name: str, value: float | None, sample_rate: float | None) -> int:
@@ -231,6 +231,11 @@ def _in_chunks(
     noise = None if noise is None else noise[:lags]
     weighted = scale.dtype != bool
     task = make_task(window * n, step * n, n, noise, statistics, weighted, n_windows)
+    return _from_shared_sums(W, y, scale, task)
+
+
+def _from_shared_sums(W: Array, y: Array, scale: Array, task: Task) -> Any:
+    """All windows of a task, on all cores in numpy's memory, or inside somebody's compiled program."""
     return solve_traced(_rows(W, y, scale), task) if _traced(W, y, scale) else solve_all(_as_piece(W, y, scale), task)
 
 

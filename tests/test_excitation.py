@@ -146,7 +146,7 @@ def test_gradients_are_central_differences(objective: str, window: float | None)
     limits = Limits(position=(-10.5, 10.5), velocity=20.0, torque=0.012)
     problem = excitation._problem(
         ROBOT, 4, 10.0, limits, objective, "inertia" if objective == "stderr" else None, window, False, None,
-        PARAMETERS, None, 1000.0,
+        None, PARAMETERS, None, 1000.0,
     )  # fmt: skip
     x, t, random = excitation._random_starts(problem, 4, 0), problem.instants(), np.random.default_rng(1)
 
@@ -197,6 +197,27 @@ def test_a_standard_error_is_that_of_the_measurements() -> None:
     assert design.value == pytest.approx(np.sqrt(np.linalg.inv(W.T @ W)[2, 2]), rel=1e-6)
 
 
+def test_a_mean_position_is_kept() -> None:
+    limits = Limits(position=(-0.5, 0.5))
+    design = design_excitation(HUMAN, limits=limits, window=2.0, mean=0.1, starts=4)
+    assert float(np.mean(design.sampled(100)["position"])) == pytest.approx(0.1, abs=1e-12)
+    assert np.max(design.sampled(1000)["position"]) <= 0.5
+    with pytest.raises(ValueError, match="mean"):
+        design_excitation(HUMAN, limits=limits, mean=0.7)
+
+
+def test_condition_over_sliding_windows() -> None:
+    """The window that ends at each instant, back across the beginning of the period."""
+    design = design_excitation(HUMAN, limits=Limits(position=(-0.5, 0.5)), harmonics=3, starts=4)
+    end, found = design.sliding_condition(2.0)
+    motion = design.sampled(len(end) / design.period)
+    W = np.asarray(HUMAN.observation_matrix(motion["position"], motion["velocity"], motion["acceleration"]))
+    W, n = np.concatenate([W, W]), round(2.0 / design.period * len(end))
+    for k in (0, 7, len(end) - 1):
+        last = len(end) + k
+        assert found[k] == pytest.approx(np.linalg.cond(W[last + 1 - n : last + 1]), rel=1e-9)
+
+
 def test_columns_compared_by_the_torque_that_they_make() -> None:
     scale = np.array([1e-3, 0.05, 2.0])
     design = design_excitation(HUMAN, scale=scale, starts=8, harmonics=8, period=2.0)
@@ -211,7 +232,9 @@ def test_the_encoder_is_in_the_loop() -> None:
     limits = Limits(position=(-0.5, 0.5))
     design = design_excitation(HUMAN, limits=limits, encoder=encoder, starts=8, objective="sigma_min")
     t = np.arange(1000) / 100
-    problem = excitation._problem(HUMAN, 5, 10.0, limits, "sigma_min", None, None, False, None, None, encoder, 100.0)
+    problem = excitation._problem(
+        HUMAN, 5, 10.0, limits, "sigma_min", None, None, False, None, None, None, encoder, 100.0
+    )
     series = FourierSeries(*(np.atleast_2d(x) for x in (design.trajectory.sine, design.trajectory.cosine)),
                            np.atleast_1d(design.trajectory.offset), 10.0)  # fmt: skip
     rows = excitation._rows(problem, excitation._measured(encoder, series, jnp.asarray(t)), None)[:, 0]

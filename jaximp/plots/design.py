@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaximp.excitation import Design
-from jaximp.plots.style import BLACK, LINES, WIDTH, Numbers, draw_line, styled
+from jaximp.plots.style import BLACK, LINES, WIDTH, draw_line, styled
 from jaximp.trajectories import FourierSeries
 
 UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
@@ -37,7 +37,7 @@ def design(found: Design) -> Figure:
     if n > 1:
         axes[0].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     _harmonics(spectrum, series)
-    _sliding_condition(condition, found, motion)
+    _sliding_condition(condition, found)
     return figure
 
 
@@ -53,21 +53,11 @@ def _harmonics(panel: Axes, series: FourierSeries) -> None:
     )
 
 
-def _sliding_condition(panel: Axes, found: Design, motion: dict[str, Numbers]) -> None:
-    """Condition number of the window that ends at each time; the motion is periodic, and so are windows."""
-    rows = np.asarray(
-        found.model.observation_matrix(*(motion[name] for name in ("position", "velocity", "acceleration")))
-    )
-    products = np.einsum("tni,tnj->tij", *[rows.reshape(len(rows), found.model.n_joints, -1)] * 2)
-    sums = np.cumsum(np.concatenate([np.zeros_like(products[:1]), products, products]), axis=0)
+def _sliding_condition(panel: Axes, found: Design) -> None:
     lengths = [found.window] if found.window else [found.period / 10, found.period / 5, found.period / 2]
     for k, length in enumerate(lengths):
-        n = max(1, round(length / found.period * len(rows)))
-        values = np.linalg.eigvalsh(sums[len(rows) + 1 :] - sums[len(rows) + 1 - n : len(sums) - n])
-        with np.errstate(invalid="ignore", divide="ignore"):
-            cond = np.sqrt(values[:, -1] / np.where(values[:, 0] > 1e-14 * values[:, -1], values[:, 0], np.nan))
         color, style = LINES[k % len(LINES)]
-        draw_line(panel, motion["time"], cond, color=color, linestyle=style, label=f"{length:g} s")
+        draw_line(panel, *found.sliding_condition(length), color=color, linestyle=style, label=f"{length:g} s")
     panel.axhline(found.condition, color=BLACK, linewidth=0.8, label="whole period")
     panel.set(
         title="Condition number of sliding windows",
