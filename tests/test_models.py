@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.models import MOTION, HumanJoint, Joints, Model, RobotJoint, combine, parameter_units
+from jaximp.models import MOTION, HumanJoint, Joints, Model, PlanarArm, RobotJoint, combine, parameter_units
 from jaximp.models.joint import sine_and_cosine
 
 Numbers = NDArray[np.float64]
@@ -73,6 +73,34 @@ def side_by_side(*parts: tuple[Torque, int]) -> Torque:
     return torque
 
 
+def eq13(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers) -> Numbers:
+    """Inertial torque of eq. (13) of Lakatos et al. 2011."""
+    (_, q2), (v1, v2), (a1, a2) = (np.moveaxis(x, -1, 0) for x in (q, dq, ddq))
+    first = b[0] * a1 + b[1] * ((2 * a1 + a2) * np.cos(q2) - (2 * v1 * v2 + v2**2) * np.sin(q2)) + b[2] * a2
+    second = b[1] * (a1 * np.cos(q2) + v1**2 * np.sin(q2)) + b[2] * (a1 + a2)
+    return np.stack([first, second], axis=-1)
+
+
+def spring_and_damper(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers, rest: tuple[float, float]) -> Numbers:
+    """Eq. (8) of Lakatos et al. 2011: D, then K, row by row."""
+    return dq @ b[:4].reshape(2, 2).T + (q - np.array(rest)) @ b[4:].reshape(2, 2).T
+
+
+def arm_weight(b: Numbers, q: Numbers, g: float = 9.81) -> Numbers:
+    """Torque that holds an arm in the vertical plane, whose first angle is from the horizontal."""
+    forearm = b[1] * g * np.cos(q[..., 0] + q[..., 1])
+    return np.stack([b[0] * g * np.cos(q[..., 0]) + forearm, forearm], axis=-1)
+
+
+def arm(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers) -> Numbers:
+    return eq13(b[:3], q, dq, ddq) + spring_and_damper(b[3:], q, dq, ddq, (0.08, 1.0))
+
+
+def arm_robot(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers) -> Numbers:
+    friction = b[5:7] * dq + b[7:9] * np.sign(dq)
+    return eq13(b[:3], q, dq, ddq) + arm_weight(b[3:5], q, 1.62) + friction + b[9:11]
+
+
 def added(first: Torque, p: int, second: Torque) -> Torque:
     return lambda b, q, dq, ddq: first(b[:p], q, dq, ddq) + second(b[p:], q, dq, ddq)
 
@@ -86,6 +114,8 @@ class Case:
 
 
 ROBOT, HUMAN = RobotJoint(gear_ratio=15.0), HumanJoint(gear_ratio=15.0)
+ARM = PlanarArm(equilibrium=(0.08, 1.0))
+ARM_ROBOT = PlanarArm(impedance=False, gravity=True, viscous=True, coulomb=True, offset=True, g=1.62)
 TWO_ROBOTS, TWO_HUMANS = Joints(ROBOT, ROBOT), Joints(HUMAN, HumanJoint(offset=False))
 CASES = [
     Case("robot", ROBOT, robot15, 5),
@@ -132,6 +162,24 @@ CASES = [
             axis=-1,
         ),
         13,
+    ),
+    Case("arm", ARM, arm, 11),
+    Case("arm as a robot", ARM_ROBOT, arm_robot, 11),
+    Case(
+        "arm of known inertia",
+        PlanarArm(equilibrium=(-0.5, 0.0), inertia=False),
+        lambda b, q, dq, ddq: spring_and_damper(b, q, dq, ddq, (-0.5, 0.0)),
+        8,
+    ),
+    Case(
+        "combine(Joints, arm)",
+        combine(TWO_ROBOTS, ARM),
+        # Merged: viscous friction with damping_11 and _22, the first inertia with inertia_1.
+        lambda b, q, dq, ddq: (
+            side_by_side((robot15, 5), (robot15, 5))(b[:10], q, dq, ddq)
+            + arm(np.r_[0.0, b[10:12], 0.0, b[12:14], 0.0, b[14:18]], q, dq, ddq)
+        ),
+        18,
     ),
 ]
 
@@ -251,6 +299,12 @@ def test_a_motion_of_another_shape_is_refused(case: Case) -> None:
         pytest.param(RobotJoint(inertia=False, viscous=False), HumanJoint(), id="nothing shared"),
         pytest.param(RobotJoint(joint="prismatic"), HumanJoint(joint="prismatic"), id="prismatic"),
         pytest.param(TWO_ROBOTS, TWO_HUMANS, id="two joints"),
+        pytest.param(TWO_ROBOTS, ARM, id="two robots, arm"),
+        pytest.param(
+            Joints(*[RobotJoint(offset=True)] * 2),
+            PlanarArm((0.0, 0.0), gravity=True, offset=True),
+            id="two robots, arm under gravity",
+        ),
     ],
 )
 def test_combine_merges_equal_columns_and_keeps_the_torque(robot: Model, human: Model) -> None:
