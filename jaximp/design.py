@@ -36,6 +36,9 @@ class DesignSettings:
     """Mean position [rad or m], for all joints or for each; free where it is not given."""
     sample_rate: float = 1000.0
     """Of the controller, and of the exported motion [Hz]."""
+    identify: str | None = None
+    """Where the model has both: `human` if the robot is known by then (methods 1 and 3), or `robot`; else both. The
+    torque is that of both in any case, and so are the parameters."""
     joints: int = 1
     """Joints side by side."""
     starts: int = 32
@@ -70,11 +73,14 @@ class DesignJob:
     def run(self, progress: Progress = lambda share: None) -> Design:
         """Design the motion."""
         wanted = dict(vars(self.design))
-        model = self._made(joints=wanted.pop("joints"))
+        joints, identify = wanted.pop("joints"), wanted.pop("identify")
+        moved = self._made(("robot", "human"), joints)
+        model = moved if identify is None else self._made((identify,), joints)
         return design_excitation(
             model,
+            moved=moved,
             limits=self.limits,
-            parameters=_by_name(self.parameters, model, "parameters"),
+            parameters=_by_name(self.parameters, moved, "parameters"),
             scale=_by_name(self.scale, model, "scale"),
             encoder=None
             if self.encoder is None
@@ -83,11 +89,11 @@ class DesignJob:
             **wanted,
         )
 
-    def _made(self, joints: int) -> Model:
+    def _made(self, whom: tuple[str, ...], joints: int) -> Model:
         """Robot, human, or both with the columns that they share merged; joints side by side."""
         robot, human = self.model.robot, self.model.human
-        made: list[Model] = [] if robot is None else [RobotJoint(**vars(robot))]
-        made += [] if human is None else [HumanJoint(**vars(human))]
+        made: list[Model] = [] if robot is None or "robot" not in whom else [RobotJoint(**vars(robot))]
+        made += [] if human is None or "human" not in whom else [HumanJoint(**vars(human))]
         one = made[0] if len(made) == 1 else combine(*made)
         return one if joints == 1 else Joints(*[one] * joints)
 
@@ -128,6 +134,11 @@ def parse_design_job(text: str) -> DesignJob:
             raise ValueError(
                 f"design.{name} is '{getattr(design, name)}': {nearest(getattr(design, name), list(choices))}"
             )
+    both = model.robot is not None and model.human is not None
+    if design.identify is not None and not (both and design.identify in ("robot", "human")):
+        raise ValueError(
+            f"design.identify is '{design.identify}': it must be 'human' or 'robot', and the model must have both"
+        )
     if design.joints < 1:
         raise ValueError(f"design.joints is {design.joints}: there must be at least one")
     encoder = tables.get("encoder")

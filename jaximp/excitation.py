@@ -8,9 +8,7 @@ is exact, and all starts descend at once.
 offset and goes as far that way as the limits allow. For all limits but the torque's that is a division; the torque's is
 a root, found by bisection and differentiated as an implicit function. Nothing is penalised, no weight is chosen.
 
-**Objectives** see the Gram matrix `W'W` alone, p by p, of the period or of every window. Singular values are roots of
-its eigenvalues, whose derivative is `v' dG v`: exact for distinct values however close, and one of the subgradients
-(that of whichever eigenvectors come out) where they coincide.
+**Objectives** see the Gram matrix `W'W` alone, p by p, of the period or of every window (`objectives.py`).
 """
 
 from __future__ import annotations
@@ -27,16 +25,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from numpy.typing import NDArray
+from jaxtyping import Array
 
-from jaximp import engine
 from jaximp.bounds import condition_bound
 from jaximp.models import Model
+from jaximp.objectives import log_condition, log_sigma_min, log_stderr, log_volume
 from jaximp.optimise import METHODS, minimise, onto_polytope
 from jaximp.signals import butterworth, central_differences, require_float64
 from jaximp.trajectories import FourierSeries, at_rest, jerk
-from jaximp.types import AnyArray, Progress, nearest
+from jaximp.types import AnyArray, Numbers, Progress, nearest
 
 OBJECTIVES = {
     "condition": "condition number of the regressor",
@@ -96,6 +93,7 @@ class Design:
 
     trajectory: FourierSeries
     model: Model
+    """The model that is to be identified."""
     condition: float
     """Condition number of the regressor over one period."""
     worst_condition: float
@@ -113,12 +111,14 @@ class Design:
     limits: Limits
     active: tuple[str, ...]
     """The limits that the motion reaches, in words."""
-    conditions: NDArray[np.float64]
+    conditions: Numbers
     """Condition number, over the period or of the worst window, that every start has reached; best first."""
-    parameters: NDArray[np.float64] | None = None
-    """The model's parameters, where they were given."""
+    parameters: Numbers | None = None
+    """Those of the model of everything that is moved, where they were given."""
     window: float | None = None
     """Length of the windows that were designed for [s]."""
+    moved: Model | None = None
+    """The model of everything that is moved, if that is more than is to be identified."""
 
     def in_words(self) -> list[str]:
         """What was found, a line for each fact."""
@@ -136,7 +136,7 @@ class Design:
         lines.append("limits reached: " + (", ".join(self.active) or "none"))
         return lines
 
-    def sliding_condition(self, length: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sliding_condition(self, length: float) -> tuple[Numbers, Numbers]:
         """Condition number of the regressor in every window of `length` seconds.
 
         **Returns:** the end of each window (M,) [s], evenly spread over one period, and its condition number (M,),
@@ -154,14 +154,14 @@ class Design:
         cond = np.sqrt(np.divide(high, low, out=np.full(count, np.inf), where=known))
         return motion["time"], np.roll(cond, n - 1)
 
-    def sampled(self, sample_rate: float) -> dict[str, NDArray[np.float64]]:
+    def sampled(self, sample_rate: float) -> dict[str, Numbers]:
         """One period at a controller's sample rate [Hz]: `time`, `position`, `velocity`, `acceleration` (N, n), and
-        `torque` where the model's parameters are known."""
+        `torque` of everything that is moved, where its parameters are known."""
         time = np.arange(round(self.period * sample_rate)) / sample_rate
         q, dq, ddq = (np.asarray(x) for x in self.trajectory(time))
         found = {"time": time, "position": q, "velocity": dq, "acceleration": ddq}
         if self.parameters is not None:
-            found["torque"] = np.asarray(self.model.torque(self.parameters, q, dq, ddq))
+            found["torque"] = np.asarray((self.moved or self.model).torque(self.parameters, q, dq, ddq))
         return found
 
 
@@ -169,6 +169,7 @@ class _Problem(eqx.Module):
     """What is designed, as arrays and static settings."""
 
     model: Model
+    moved: Model
     period: float = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
     rest: bool = eqx.field(static=True)
@@ -215,6 +216,7 @@ def design_excitation(
     mean: Any = None,
     scale: Any = None,
     parameters: Any = None,
+    moved: Model | None = None,
     encoder: Encoder | None = None,
     sample_rate: float = 1000.0,
     starts: int = 32,
@@ -228,7 +230,9 @@ def design_excitation(
     (`stderr` is that of `parameter`, by its name), over the whole period, or over the worst of all sliding windows of
     `window` seconds. `rest` makes the period begin and end at rest. `mean` position [rad or m], for all joints or for
     each; where it is not given, it is designed as well. `scale` (p,) the size of each parameter: columns are compared
-    by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs.
+    by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs. Where more is moved
+    than is to be identified, such as a known robot with the human in it, `moved` is the model of it all, and the
+    `parameters` and the limit of the torque are its.
     `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
     error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them.
 
@@ -240,23 +244,13 @@ def design_excitation(
     **Source:** Tout et al. 2023, III-A; the series of Swevers et al. 1997.
     """
     require_float64()
-    problem = _problem(
-        model,
-        harmonics,
-        period,
-        limits,
-        objective,
-        parameter,
-        window,
-        rest,
-        mean,
-        scale,
-        parameters,
-        encoder,
-        sample_rate,
-    )
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    problem = _problem(
+        model, moved or model, harmonics=harmonics, period=period, limits=limits, objective=objective,
+        parameter=parameter, window=window, rest=rest, mean=mean, scale=scale, parameters=parameters,
+        encoder=encoder, sample_rate=sample_rate,
+    )  # fmt: skip
     x = _random_starts(problem, starts, seed)
     x = _descend(problem, x, method, progress)
     found = [_judged(problem, one) for one in x]
@@ -272,72 +266,54 @@ def design_excitation(
     return Design(
         series, model, condition, worst, bound, source, period, objective, _in_units(problem, value), limits,
         _active(problem, series), conditions, None if parameters is None else np.asarray(parameters, float), window,
+        moved,
     )  # fmt: skip
 
 
 def _problem(
     model: Model,
+    moved: Model,
+    *,
     harmonics: int,
     period: float,
     limits: Limits,
     objective: str,
-    parameter: str | None,
-    window: float | None,
-    rest: bool,
-    mean: Any,
-    scale: Any,
-    parameters: Any,
-    encoder: Encoder | None,
-    sample_rate: float,
+    parameter: str | None = None,
+    window: float | None = None,
+    rest: bool = False,
+    mean: Any = None,
+    scale: Any = None,
+    parameters: Any = None,
+    encoder: Encoder | None = None,
+    sample_rate: float = 1000.0,
 ) -> _Problem:
     """The settings, checked."""
-    n, p = model.n_joints, len(model.names)
-    if harmonics < (3 if rest else 1):
-        raise ValueError(f"harmonics is {harmonics}: give at least {3 if rest else 1}")
-    for name, number in (("period", period), ("sample_rate", sample_rate)):
-        if not (math.isfinite(number) and number > 0):
-            raise ValueError(f"{name} is {number}: it must be a number above zero")
-    if objective not in OBJECTIVES:
-        raise ValueError(f"objective is '{objective}': {nearest(objective, list(OBJECTIVES))}")
-    if (objective == "stderr") != (parameter is not None):
-        raise ValueError("the objective 'stderr' needs a parameter, and no other objective takes one")
-    if parameter is not None and parameter not in model.names:
-        raise ValueError(f"parameter is '{parameter}': {nearest(parameter, list(model.names))}")
-    if window is not None and not 0 < window <= period:
-        raise ValueError(f"window is {window:g} s: it must be above zero and no longer than the period of {period:g} s")
-    if encoder is not None and not round(period * encoder.sample_rate) >= 2 * harmonics:
-        raise ValueError("the encoder takes fewer than two samples in a period of the highest harmonic")
-    low, high = (_per_joint(f"limits.position[{k}]", x, n) for k, x in enumerate(limits.position))
-    most = np.stack([_per_joint(f"limits.{name}", getattr(limits, name), n) for name in _SYMMETRIC])
-    if not (np.isfinite(low) == np.isfinite(high)).all():
-        raise ValueError("limits.position is finite on one side only: give both, or neither")
-    if not (low < high).all():
-        raise ValueError(f"limits.position: the lowest, {low.tolist()}, is not below the highest, {high.tolist()}")
+    if model.n_joints != moved.n_joints:
+        raise ValueError(f"the model has {model.n_joints} joints, but the one of what is moved {moved.n_joints}")
+    _check_motion(harmonics, period, sample_rate, window, rest, encoder)
+    _check_objective(model, objective, parameter)
+    low, high, most = _room(limits, model.n_joints)
     if mean is not None:
-        mean = _per_joint("mean", mean, n)
+        mean = jnp.asarray(_per_joint("mean", mean, model.n_joints))
         if not ((low < mean) & (mean < high)).all():
             raise ValueError(f"mean is {mean.tolist()}: it must be inside limits.position")
-    for name, most_of in zip(_SYMMETRIC, most, strict=True):
-        if not (most_of > 0).all():
-            raise ValueError(f"limits.{name} is {most_of.tolist()}: no motion keeps a limit that is not above zero")
     if np.isfinite(most[-1]).any() and parameters is None:
         raise ValueError("limits.torque needs the parameters of the model: pass parameters=...")
-    for name, values in (("parameters", parameters), ("scale", scale)):
-        if values is not None and (np.shape(values) != (p,) or not np.isfinite(values).all()):
-            raise ValueError(f"{name} must be {p} finite numbers, one for each of {', '.join(model.names)}")
-    if scale is not None and not (np.asarray(scale) > 0).all():
+    scale = jnp.ones(len(model.names)) if scale is None else _per_parameter("scale", scale, model)
+    if not (scale > 0).all():
         raise ValueError("scale must be above zero: it is the size of each parameter")
     return _Problem(
         model=model,
+        moved=moved,
         period=float(period),
         harmonics=harmonics,
         rest=rest,
         low=jnp.asarray(low),
         high=jnp.asarray(high),
         most=jnp.asarray(most),
-        parameters=None if parameters is None else jnp.asarray(parameters, float),
-        scale=jnp.ones(p) if scale is None else jnp.asarray(scale, float),
-        mean=None if mean is None else jnp.asarray(mean),
+        parameters=None if parameters is None else _per_parameter("parameters", parameters, moved),
+        scale=scale,
+        mean=mean,
         objective=objective,
         parameter=-1 if parameter is None else model.names.index(parameter),
         window=None if window is None else window / period,
@@ -346,14 +322,57 @@ def _problem(
     )
 
 
+def _check_motion(
+    harmonics: int, period: float, sample_rate: float, window: float | None, rest: bool, encoder: Encoder | None
+) -> None:
+    if harmonics < (3 if rest else 1):
+        raise ValueError(f"harmonics is {harmonics}: give at least {3 if rest else 1}")
+    for name, number in (("period", period), ("sample_rate", sample_rate)):
+        if not (math.isfinite(number) and number > 0):
+            raise ValueError(f"{name} is {number}: it must be a number above zero")
+    if window is not None and not 0 < window <= period:
+        raise ValueError(f"window is {window:g} s: it must be above zero and no longer than the period of {period:g} s")
+    if encoder is not None and not round(period * encoder.sample_rate) >= 2 * harmonics:
+        raise ValueError("the encoder takes fewer than two samples in a period of the highest harmonic")
+
+
+def _check_objective(model: Model, objective: str, parameter: str | None) -> None:
+    if objective not in OBJECTIVES:
+        raise ValueError(f"objective is '{objective}': {nearest(objective, list(OBJECTIVES))}")
+    if (objective == "stderr") != (parameter is not None):
+        raise ValueError("the objective 'stderr' needs a parameter, and no other objective takes one")
+    if parameter is not None and parameter not in model.names:
+        raise ValueError(f"parameter is '{parameter}': {nearest(parameter, list(model.names))}")
+
+
 _SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
 
 
-def _per_joint(name: str, value: Any, n: int) -> NDArray[np.float64]:
+def _room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:
+    """Lowest and highest position (n,), and the most of everything else (4, n)."""
+    low, high = (_per_joint(f"limits.position[{k}]", x, n) for k, x in enumerate(limits.position))
+    most = np.stack([_per_joint(f"limits.{name}", getattr(limits, name), n) for name in _SYMMETRIC])
+    if not (np.isfinite(low) == np.isfinite(high)).all():
+        raise ValueError("limits.position is finite on one side only: give both, or neither")
+    if not (low < high).all():
+        raise ValueError(f"limits.position: the lowest, {low.tolist()}, is not below the highest, {high.tolist()}")
+    for name, most_of in zip(_SYMMETRIC, most, strict=True):
+        if not (most_of > 0).all():
+            raise ValueError(f"limits.{name} is {most_of.tolist()}: no motion keeps a limit that is not above zero")
+    return low, high, most
+
+
+def _per_joint(name: str, value: Any, n: int) -> Numbers:
     given = np.asarray(value, float)
     if given.shape not in ((), (n,)) or np.isnan(given).any():
         raise ValueError(f"{name} is {value}: give one number, or one for each of {n} joints")
     return np.broadcast_to(given, (n,))
+
+
+def _per_parameter(name: str, values: Any, model: Model) -> Array:
+    if np.shape(values) != (len(model.names),) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be {len(model.names)} finite numbers, one for each of {', '.join(model.names)}")
+    return jnp.asarray(values, float)
 
 
 # The motion that a vector of numbers stands for.
@@ -423,17 +442,16 @@ def _within_torque(
 def _torque_share(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None) -> Array:
     """(n,) largest torque as a share of its limit."""
     assert problem.parameters is not None
-    torque = _rows(problem, series(t), smooth) @ problem.parameters
+    torque = _rows(problem.moved, series(t), smooth) @ problem.parameters
     return jnp.abs(torque).max(axis=0) / problem.most[-1]
 
 
 # What a motion is worth.
 
 
-def _rows(problem: _Problem, motion: tuple[Array, ...], smooth: Array | None) -> Array:
+def _rows(model: Model, motion: tuple[Array, ...], smooth: Array | None) -> Array:
     """(N, n, p) regressor; dry friction changes sign within a share `smooth` of the largest velocity."""
-    q, dq, ddq = motion
-    model, one_joint = problem.model, problem.n == 1
+    (q, dq, ddq), one_joint = motion, model.n_joints == 1
     if smooth is not None:
         width = jnp.maximum(smooth * jnp.abs(dq).max(axis=0), jnp.finfo(dq.dtype).eps)  # at rest it would vanish
         model = model.smoothed(width[0] if one_joint else width)
@@ -460,7 +478,7 @@ def _measured(encoder: Encoder, series: FourierSeries, t: Array) -> tuple[Array,
 def _grams(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, whole: bool = False) -> Array:
     """(M, p, p) sums over the period, or over every sliding window, as many as measurements in the same time make."""
     motion = series(t) if problem.encoder is None else _measured(problem.encoder, series, t)
-    rows = _rows(problem, motion, smooth) * problem.scale
+    rows = _rows(problem.model, motion, smooth) * problem.scale
     products = jnp.einsum("tni,tnj->tij", rows, rows) * (problem.samples / len(t))
     if problem.window is None or whole:
         return products.sum(axis=0)[None]
@@ -473,82 +491,6 @@ def _sliding_sums(products: AnyArray, length: int) -> Array:
     products = jnp.asarray(products)
     sums = jnp.cumsum(jnp.concatenate([jnp.zeros_like(products[:1]), products, products[:length]]), axis=0)
     return sums[length : length + len(products)] - sums[: len(products)]
-
-
-@jax.custom_jvp
-def extreme_eigenvalues(gram: Float[Array, "*M p p"]) -> tuple[Float[Array, "*M"], Float[Array, "*M"]]:
-    """Smallest and largest eigenvalue of positive definite matrices, without LAPACK: its batched calls can block each
-    other for ever where several programs run at a time. No smaller than what rounding leaves of the largest."""
-    low, high = engine.extreme_eigenvalues(_lanes(gram))
-    floor = jnp.finfo(gram.dtype).eps * high
-    return jnp.maximum(low, floor).reshape(gram.shape[:-2]), high.reshape(gram.shape[:-2])
-
-
-@extreme_eigenvalues.defjvp
-def _derivative_of_extremes(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
-    (gram,), (change,) = primals, tangents
-    low, high = extreme_eigenvalues(gram)
-    unit = jnp.eye(gram.shape[-1], dtype=gram.dtype)
-    shift = 1e-12 * high
-    slopes = []
-    for matrix in (
-        gram - (low - shift)[..., None, None] * unit,
-        (high + shift)[..., None, None] * unit - gram,
-    ):
-        v = _null_vector(matrix)
-        slopes.append(jnp.einsum("...i,...ij,...j->...", v, change, v))
-    return (low, high), tuple(slopes)
-
-
-def _null_vector(matrix: Float[Array, "*M p p"]) -> Float[Array, "*M p"]:
-    """Unit vectors that positive semidefinite matrices nearly annihilate, by inverse iteration."""
-    p = matrix.shape[-1]
-    lanes, shape = _lanes(matrix), matrix.shape[:-2]
-    # No eigenvector is orthogonal to this start but by chance.
-    v = jnp.asarray(1 + 0.1 * np.sin(np.arange(1.0, p + 1)))[:, None] * jnp.ones_like(lanes[0])
-    for _ in range(3):
-        x = jnp.stack(engine.substitute(engine.cholesky(_bordered(lanes, v)), p))
-        v = x / jnp.sqrt((x**2).sum(axis=0))
-    return jnp.moveaxis(v, 0, -1).reshape(*shape, p)
-
-
-def _lanes(matrices: Float[Array, "*M p p"]) -> Float[Array, "p p lanes"]:
-    """Matrices side by side along the last axis, where `engine` works on all of them at a time."""
-    p = matrices.shape[-1]
-    return jnp.moveaxis(matrices.reshape(-1, p, p), 0, -1)
-
-
-def _bordered(lanes: Array, column: Array | None = None) -> engine.Rows:
-    """Rows of the upper triangle, with one more column for a system of equations."""
-    rows = [lanes[i, i:] for i in range(len(lanes))]
-    if column is None:
-        return tuple(rows)
-    return (*(jnp.concatenate([row, column[i][None]]) for i, row in enumerate(rows)), jnp.ones_like(column[:1]))
-
-
-def log_condition(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
-    """Logarithm of the condition number of W, from its Gram matrix."""
-    low, high = extreme_eigenvalues(gram)
-    return 0.5 * (jnp.log(high) - jnp.log(low))
-
-
-def log_volume(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
-    """Minus half the logarithm of the determinant of the Gram matrix, per parameter."""
-    pivots = jnp.stack([row[0] for row in engine.cholesky(_bordered(_lanes(gram)))])
-    return -jnp.log(pivots).mean(axis=0).reshape(gram.shape[:-2])
-
-
-def log_sigma_min(gram: Float[Array, "*M p p"]) -> Float[Array, "*M"]:
-    """Minus the logarithm of the smallest singular value of W."""
-    return -0.5 * jnp.log(extreme_eigenvalues(gram)[0])
-
-
-def log_stderr(gram: Float[Array, "*M p p"], parameter: int) -> Float[Array, "*M"]:
-    """Logarithm of the standard error of one parameter for torque noise of 1 N m."""
-    p, lanes = gram.shape[-1], _lanes(gram)
-    unit = jnp.zeros_like(lanes[0]).at[parameter].set(1)
-    variance = engine.substitute(engine.cholesky(_bordered(lanes, unit)), p)[parameter]
-    return 0.5 * jnp.log(variance).reshape(gram.shape[:-2])
 
 
 def _worth(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, sharpness: Array | None) -> Array:
@@ -581,7 +523,7 @@ def _random_starts(problem: _Problem, count: int, seed: int) -> Array:
     return jnp.asarray(x)
 
 
-def _rests(problem: _Problem, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+def _rests(problem: _Problem, count: int, random: np.random.Generator) -> Numbers:
     x = random.normal(size=(max(count, 4000), problem.n))
     if problem.parameters is None or not np.isfinite(problem.most[-1]).any():
         return 0.5 * x[:count]

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 AnyArray = Any
 """What public functions take: arrays of JAX or numpy. (Their shape and kind of number are checked all the same.)"""
 
+Numbers = NDArray[np.float64]
+
 JOINT_TYPES = ("revolute", "prismatic")
 
 Progress = Callable[[float], None]

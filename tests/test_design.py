@@ -123,3 +123,19 @@ def test_a_wrong_job_names_the_key(old: str, new: str, message: str) -> None:
 def test_a_missing_job_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no such job file"):
         read_design_job(tmp_path / "none.toml")
+
+
+def test_the_human_in_a_known_robot() -> None:
+    text = JOB.replace(
+        "robot = { gear_ratio = 15 }", "robot = { gear_ratio = 15 }\nhuman = { gear_ratio = 15, offset = false }"
+    )
+    text = text.replace("viscous_friction = ", '"robot.viscous_friction+human.damping" = ')
+    text = text.replace("inertia = 1.9e-5", '"robot.inertia+human.inertia" = 1.9e-5\n"human.stiffness" = 1e-3')
+    for name in ("gravity_x", "gravity_y", "coulomb_friction"):
+        text = text.replace(f"{name} = ", f'"robot.{name}" = ')
+    text = text.replace("velocity = 12", "").replace("torque = 0.02", "torque = 0.012")
+    design = parse_design_job(text + 'identify = "human"').run()
+    assert design.model.names == ("inertia", "damping", "stiffness")
+    assert 0.99 * 0.012 < np.abs(design.sampled(2400)["torque"]).max() < 0.012 * (1 + 1e-4)
+    with pytest.raises(ValueError, match="identify"):
+        parse_design_job(JOB + 'identify = "human"')

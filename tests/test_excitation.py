@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp import excitation
+from jaximp import excitation, objectives
 from jaximp.bounds import condition_bound
 from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.models import HumanJoint, Joints, Model, RobotJoint
@@ -144,9 +144,10 @@ def test_errors_name_the_cause(settings: dict[str, Any], message: str) -> None:
 def test_gradients_are_central_differences(objective: str, window: float | None) -> None:
     """Through limits of every kind, the torque's root among them."""
     limits = Limits(position=(-10.5, 10.5), velocity=20.0, torque=0.012)
+    parameter = "inertia" if objective == "stderr" else None
     problem = excitation._problem(
-        ROBOT, 4, 10.0, limits, objective, "inertia" if objective == "stderr" else None, window, False, None,
-        None, PARAMETERS, None, 1000.0,
+        ROBOT, ROBOT, harmonics=4, period=10.0, limits=limits, objective=objective, parameter=parameter, window=window,
+        parameters=PARAMETERS,
     )  # fmt: skip
     x, t, random = excitation._random_starts(problem, 4, 0), problem.instants(), np.random.default_rng(1)
 
@@ -172,7 +173,7 @@ def test_derivatives_of_nearly_equal_eigenvalues(p: int, gap: float) -> None:
     values = np.sort(np.r_[1.0, 1 + gap, random.uniform(2, 8, p)][:p])
     change = random.normal(size=(p, p))
     gram, change = Q * values @ Q.T, change + change.T
-    slope = float(jax.grad(lambda s: excitation.log_sigma_min(jnp.asarray(gram + s * change)[None])[0])(0.0))
+    slope = float(jax.grad(lambda s: objectives.log_sigma_min(jnp.asarray(gram + s * change)[None])[0])(0.0))
     v = np.linalg.eigh(gram)[1][:, 0]
     assert slope == pytest.approx(-0.5 * v @ change @ v, rel=1e-6)
 
@@ -181,11 +182,11 @@ def test_objectives_are_what_they_say() -> None:
     W = np.random.default_rng(0).normal(size=(50, 4)) * [1, 2, 3, 4]
     gram = jnp.asarray(W.T @ W)[None]
     singular = np.linalg.svd(W, compute_uv=False)
-    assert float(excitation.log_condition(gram)[0]) == pytest.approx(np.log(singular[0] / singular[-1]))
-    assert float(excitation.log_sigma_min(gram)[0]) == pytest.approx(-np.log(singular[-1]))
-    assert float(excitation.log_volume(gram)[0]) == pytest.approx(-np.log(singular).sum() / 4)
+    assert float(objectives.log_condition(gram)[0]) == pytest.approx(np.log(singular[0] / singular[-1]))
+    assert float(objectives.log_sigma_min(gram)[0]) == pytest.approx(-np.log(singular[-1]))
+    assert float(objectives.log_volume(gram)[0]) == pytest.approx(-np.log(singular).sum() / 4)
     expected = 0.5 * np.log(np.linalg.inv(W.T @ W)[2, 2])
-    assert float(excitation.log_stderr(gram, 2)[0]) == pytest.approx(expected)
+    assert float(objectives.log_stderr(gram, 2)[0]) == pytest.approx(expected)
 
 
 def test_a_standard_error_is_that_of_the_measurements() -> None:
@@ -218,6 +219,19 @@ def test_condition_over_sliding_windows() -> None:
         assert found[k] == pytest.approx(np.linalg.cond(W[last + 1 - n : last + 1]), rel=1e-9)
 
 
+def test_what_is_moved_may_be_more_than_what_is_identified() -> None:
+    """Methods 1 and 3: the robot is known, and yet the motor must carry it."""
+    moved, limits = ROBOT + HUMAN, Limits(position=(-10.5, 10.5), torque=0.012)
+    parameters = np.concatenate([PARAMETERS, [0.0, 0.0, 1e-3]])
+    design = design_excitation(HUMAN, moved=moved, parameters=parameters, limits=limits, starts=4)
+    motion = design.sampled(2400)
+    q, dq, ddq = (motion[name] for name in ("position", "velocity", "acceleration"))
+    np.testing.assert_allclose(motion["torque"], moved.torque(parameters, q, dq, ddq))
+    assert 0.99 * 0.012 < np.abs(motion["torque"]).max() < 0.012 * (1 + 1e-4)
+    W = np.asarray(HUMAN.observation_matrix(q, dq, ddq))
+    assert design.value == pytest.approx(np.linalg.cond(W), rel=1e-6)
+
+
 def test_columns_compared_by_the_torque_that_they_make() -> None:
     scale = np.array([1e-3, 0.05, 2.0])
     design = design_excitation(HUMAN, scale=scale, starts=8, harmonics=8, period=2.0)
@@ -232,12 +246,9 @@ def test_the_encoder_is_in_the_loop() -> None:
     limits = Limits(position=(-0.5, 0.5))
     design = design_excitation(HUMAN, limits=limits, encoder=encoder, starts=8, objective="sigma_min")
     t = np.arange(1000) / 100
-    problem = excitation._problem(
-        HUMAN, 5, 10.0, limits, "sigma_min", None, None, False, None, None, None, encoder, 100.0
-    )
     series = FourierSeries(*(np.atleast_2d(x) for x in (design.trajectory.sine, design.trajectory.cosine)),
                            np.atleast_1d(design.trajectory.offset), 10.0)  # fmt: skip
-    rows = excitation._rows(problem, excitation._measured(encoder, series, jnp.asarray(t)), None)[:, 0]
+    rows = excitation._rows(HUMAN, excitation._measured(encoder, series, jnp.asarray(t)), None)[:, 0]
     assert design.value == pytest.approx(float(np.linalg.svd(rows, compute_uv=False)[-1]), rel=1e-6)
 
 

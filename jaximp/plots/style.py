@@ -15,7 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
+from jaximp.types import Numbers
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
