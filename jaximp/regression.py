@@ -105,7 +105,7 @@ def regress(model: Model, recording: Recording, job: Job, filters: Filters) -> R
     derivatives = _measured_derivatives(job.filter, recording)
     if job.filter.mode == "window":
         return _regress_in_windows(model, recording, job, filters, q, torque)
-    W, y, speed = _filtered(model, filters, recording.sample_rate, q, torque, derivatives)
+    W, y, speed = filtered(model, filters, recording.sample_rate, q, torque, derivatives)
     valid = undisturbed(recording, filters)[:: filters.decimate]
     moving = np.asarray(speed) >= job.window.min_velocity
     valid = valid & moving if recording.n_joints == 1 else valid[:, None] & moving
@@ -134,7 +134,7 @@ def undisturbed(recording: Recording, filters: Filters, ends: bool = True) -> ND
 
 
 @eqx.filter_jit
-def _filtered(
+def filtered(
     model: Model,
     filters: Filters,
     sample_rate: float,
@@ -411,8 +411,8 @@ def column_noise(model: Model, recording: Recording, job: Job, filters: Filters)
         None if acceleration is None else with_noise(acceleration),
     )
     rate = recording.sample_rate
-    plain = np.asarray(_filtered(model, filters, rate, q, torque, (velocity, acceleration))[0])
-    noisy = np.asarray(_filtered(model, filters, rate, with_noise(q), torque, noisy_motion)[0])
+    plain = np.asarray(filtered(model, filters, rate, q, torque, (velocity, acceleration))[0])
+    noisy = np.asarray(filtered(model, filters, rate, with_noise(q), torque, noisy_motion)[0])
     difference = (noisy - plain).reshape(-1, len(model.names))
     smooth = np.array(["sign" not in column for column in model.columns])
     return np.where(smooth, np.sqrt((difference**2).mean(axis=0)), 0.0)

@@ -12,11 +12,13 @@ from jaxtyping import Array, Float, Num
 from numpy.typing import NDArray
 
 from jaximp.least_squares import SlidingFit
-from jaximp.types import AnyArray, nearest
+from jaximp.types import AnyArray, Numbers, nearest
 
 TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
 NEGATIVE = "is negative, as no mass can be"
 """Part of the reason that a wrong sign of the torque leads to."""
+Rule = tuple[NDArray[np.bool_], str, Callable[[int], str]]
+"""Which windows break it, the verdict, and the reason of a window."""
 VERDICTS = (TRUSTED, WEAK, FAKE, POOR, NO_DATA)
 
 
@@ -41,6 +43,12 @@ class TrustLimits:
     estimate by about 1/r^2, four percent at 5."""
     min_valid_share: float = 0.5
     """Share of a window's samples that must have been measured and moving."""
+    max_asymmetry: float = 0.2
+    """Of an arm's stiffness: antisymmetric over symmetric part (Lakatos et al. 2011, eq. 22), if it is beyond error."""
+    errors_apart: float = 2.0
+    """A matrix is not positive definite, or not symmetric, if that is so by so many standard errors."""
+    max_condition: float | None = None
+    """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
     parameters: tuple[str, ...] = ()
     """The parameters that matter: only their standard errors and excitation are judged. Empty for all of them."""
 
@@ -57,6 +65,78 @@ def fake_change_threshold(
     """
     singular = jnp.linalg.svd(jnp.asarray(W_reference), compute_uv=False)
     return singular[0] / singular[-1] * period_samples / window_samples
+
+
+@dataclass(frozen=True)
+class MatrixCriteria:
+    """What an impedance matrix must be to be believed, of M windows: eqs. (20), (22) of Lakatos et al. 2011.
+
+    Standard errors are of first order: `v' dK v` for an eigenvalue.
+    """
+
+    eigenvalues: Numbers
+    """(M, 2) of the symmetric part, smallest first."""
+    eigenvalue_stderr: Numbers
+    """(M, 2)."""
+    asymmetry: Numbers
+    """(M,) norm of the antisymmetric over that of the symmetric part."""
+    asymmetry_stderr: Numbers
+    """(M,)."""
+
+    def positive_definite(self) -> NDArray[np.bool_]:
+        """(M,) eq. (20)."""
+        return self.eigenvalues[:, 0] > 0
+
+    def surely_indefinite(self, errors: float) -> NDArray[np.bool_]:
+        """(M,) not positive definite by so many standard errors."""
+        return self.eigenvalues[:, 0] < -errors * self.eigenvalue_stderr[:, 0]
+
+    def quasi_symmetric(self, limits: TrustLimits = TrustLimits()) -> NDArray[np.bool_]:
+        """(M,) eq. (22), up to `limits.max_asymmetry`."""
+        return self.asymmetry <= limits.max_asymmetry
+
+    def surely_asymmetric(self, limits: TrustLimits) -> NDArray[np.bool_]:
+        """(M,) beyond `limits.max_asymmetry`, and from zero by so many standard errors."""
+        return ~self.quasi_symmetric(limits) & (self.asymmetry > limits.errors_apart * self.asymmetry_stderr)
+
+
+def matrix_criteria(
+    names: Sequence[str],
+    which: str,
+    theta: Num[AnyArray, "M p"],
+    stderr: Num[AnyArray, "M p"],
+    covariance: Num[AnyArray, "M p p"] | None = None,
+) -> MatrixCriteria | None:
+    """Criteria of the matrix `which`, `stiffness` or `damping`, whose elements are called `stiffness_11` and so on.
+
+    **Arguments:** without the `covariance` the errors of the elements are taken as independent.
+
+    **Returns:** None for a model without such a matrix.
+    """
+    elements = [f"{which}_{i}{j}" for i in (1, 2) for j in (1, 2)]
+    if not set(elements) <= set(names):
+        return None
+    index = np.array([list(names).index(element) for element in elements])
+    values, errors = np.asarray(theta)[:, index], np.asarray(stderr)[:, index]
+    if covariance is None:
+        spread = errors[:, :, None] ** 2 * np.eye(4)
+    else:
+        spread = np.asarray(covariance)[:, index[:, None], index]
+    symmetric = values.reshape(-1, 2, 2)
+    symmetric = (symmetric + symmetric.swapaxes(1, 2)) / 2
+    known = np.isfinite(symmetric).all(axis=(1, 2))
+    eigenvalues, v = np.linalg.eigh(np.where(known[:, None, None], symmetric, 0.0))
+    slopes = np.einsum("mik,mjk->mkij", v, v).reshape(-1, 2, 4)
+    variance = np.einsum("mki,mij,mkj->mk", slopes, spread, slopes)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # The norm of [[0, d], [-d, 0]] with d half the difference is |difference| / sqrt(2).
+        size = np.sqrt(2) * np.linalg.norm(symmetric, axis=(1, 2))
+        asymmetry = np.abs(values[:, 1] - values[:, 2]) / size
+        asymmetry_stderr = np.sqrt(spread[:, 1, 1] + spread[:, 2, 2] - 2 * spread[:, 1, 2]) / size
+    gone = np.where(known, 0.0, np.nan)
+    return MatrixCriteria(
+        eigenvalues + gone[:, None], np.sqrt(variance) + gone[:, None], asymmetry + gone, asymmetry_stderr + gone
+    )
 
 
 @dataclass(frozen=True)
@@ -104,7 +184,8 @@ def judge(
        regressor.
     3. *fake change*: the condition number is above the threshold of eqs. (16), (17), where one is given.
     4. *poor fit*: the model explains too little of the torque, or much less than in other windows, or gives a negative
-       inertia.
+       inertia, or an arm's stiffness or damping that is surely not positive definite, or a stiffness that is surely not
+       symmetric (`matrix_criteria`).
 
     **Arguments:** `names` (p) of the parameters; `window_samples` torque samples in a full window;
     `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
@@ -121,7 +202,7 @@ def judge(
     error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
     noisiest, loosest = ratio.argmin(axis=1), error.argmax(axis=1)
     ratio, error = ratio.min(axis=1), error.max(axis=1)
-    rules: list[tuple[NDArray[np.bool_], str, Callable[[int], str]]] = [
+    rules: list[Rule] = [
         (
             (samples < limits.min_valid_share * window_samples) | (samples < theta.shape[1]),
             NO_DATA,
@@ -148,6 +229,11 @@ def judge(
             lambda k: f"{names[loosest[k]]}: its standard error is {error[k]:.0%} of its size",
         ),
         (
+            cond > (np.inf if limits.max_condition is None else limits.max_condition),
+            WEAK,
+            lambda k: f"the condition number {cond[k]:.3g} is above {limits.max_condition:.3g}",
+        ),
+        (
             np.full(len(cond), False) if threshold is None else ~(cond < threshold),
             FAKE,
             lambda k: f"the condition number {cond[k]:.3g} is not below the threshold {threshold:.3g}",
@@ -158,7 +244,7 @@ def judge(
             lambda k: f"the model explains {vaf[k]:.0%} of the torque's variance",
         ),
     ]
-    excited = ~np.any([mask for mask, _, _ in rules[:5]], axis=0)
+    excited = ~np.any([mask for mask, verdict, _ in rules if verdict in (NO_DATA, WEAK)], axis=0)
     usual, usual_share = (_lower_quartile(values[excited]) for values in (residual, 1 - vaf))
     rules.append(
         (
@@ -170,7 +256,7 @@ def judge(
             ),
         )
     )
-    mass = np.array([name.endswith("inertia") for name in names])
+    mass = np.array([name.endswith(("inertia", "inertia_1", "inertia_3")) for name in names])
     below_zero = np.where(mass, -theta / stderr, -np.inf).max(axis=1)
     rules.append(
         (
@@ -181,6 +267,7 @@ def judge(
             ),
         )
     )
+    rules += _matrix_rules(fit, names, limits)
     broken = np.stack([mask for mask, _, _ in rules])
     first = np.where(broken.any(axis=0), broken.argmax(axis=0), len(rules))
     verdict = np.array([name for _, name, _ in rules] + [TRUSTED])[first]
@@ -188,7 +275,34 @@ def judge(
     return Verdicts(verdict, np.array(reason))
 
 
-def _lower_quartile(values: NDArray[np.float64]) -> float:
+def _matrix_rules(fit: SlidingFit, names: tuple[str, ...], limits: TrustLimits) -> list[Rule]:
+    """An arm's stiffness and damping store and take energy, and its stiffness has a potential."""
+
+    def indefinite(which: str, found: MatrixCriteria) -> Rule:
+        return (
+            found.surely_indefinite(limits.errors_apart),
+            POOR,
+            lambda k: f"the {which} is not positive definite: its smallest eigenvalue is {found.eigenvalues[k, 0]:.3g}",
+        )
+
+    rules = []
+    for which in ("stiffness", "damping"):
+        found = matrix_criteria(names, which, fit.theta, fit.stderr)
+        if found is not None:
+            rules.append(indefinite(which, found))
+    stiffness = matrix_criteria(names, "stiffness", fit.theta, fit.stderr)
+    if stiffness is not None:
+        rules.append(
+            (
+                stiffness.surely_asymmetric(limits),
+                POOR,
+                lambda k: f"the stiffness is not symmetric: its antisymmetric part is {stiffness.asymmetry[k]:.0%}",
+            )
+        )
+    return rules
+
+
+def _lower_quartile(values: Numbers) -> float:
     """Of the values above zero: a window without any torque has no residual to compare with."""
     known = values[np.isfinite(values) & (values > 0)]
     return float(np.quantile(known, 0.25)) if len(known) else np.inf

@@ -1,7 +1,7 @@
 """An arm of two links in a plane: inertia, gravity and friction, and the impedance of its muscles.
 
 Angles: `q1` of the upper arm from the x axis, `q2` of the forearm from the upper arm, both counterclockwise [rad].
-Where there is gravity it acts along -y.
+Where there is gravity it acts along -y, or along x (`zero = "hanging"`: at zero the arm hangs down).
 
 The rigid body is known by three base inertial parameters, of which two conventions are in use. With `I_i` the moment of
 inertia of link i about its own joint, `m_i` its mass, `c_i` the distance of its centre of mass from that joint, and
@@ -35,20 +35,26 @@ class PlanarArm(Model):
     - `inertia_1` to `inertia_3`: the base inertial parameters xi [kg m^2];
     - `damping_11`, `_12`, `_21`, `_22` [N m s/rad] and `stiffness_11` to `_22` [N m/rad], row by row;
     - `gravity_1 = m_1 c_1 + m_2 l1` and `gravity_2 = m_2 c_2` [kg m], on `g cos q1` and `g cos(q1 + q2)`, for an arm
-      in the vertical plane with `q1` from the horizontal: the second joint bears `gravity_2` alone;
+      in the vertical plane with `q1` from the horizontal (sines where it is from the vertical, `zero = "hanging"`): the
+      second joint bears `gravity_2` alone;
     - `viscous_friction_i * dq_i`, `coulomb_friction_i * sign(dq_i)` and `offset_torque_i`, of joint i.
 
     **Arguments:** `equilibrium` (2,) the angles [rad] at which the elastic torque vanishes; `inertia`, `impedance`,
-    `gravity`, `viscous`, `coulomb`, `offset` choose the columns. The regressor takes absolute angles. Without inertia
-    it is the reduced one of eqs. (23) to (25), for the torque less `rigid_body_torque`; without impedance it is a
-    robot's or a limp arm's. `g` is the gravitational acceleration [m/s^2].
+    `gravity`, `viscous`, `coulomb`, `offset` choose the columns. With gravity, the `length` of the upper arm [m] says
+    that `inertia_2 = length * gravity_2` and leaves only the latter. The regressor takes absolute angles. Without
+    inertia it is the reduced one of eqs. (23) to (25), for the torque less `rigid_body_torque`; without impedance it is
+    a robot's or a limp arm's. `g` is the gravitational acceleration [m/s^2].
 
-    **Raises:** ValueError for impedance without an equilibrium, or with viscous friction, whose columns it has already.
+    **Raises:** ValueError for impedance without an equilibrium, or with viscous friction, whose columns it has already,
+    and for a length without inertia or gravity.
     """
 
     equilibrium: tuple[float, float] | None
     """Angles [rad] at which the elastic torque vanishes; None without impedance."""
     g: float
+    zero: str = eqx.field(static=True)
+    length: float | None
+    """Of the upper arm [m], where it ties inertia to gravity."""
     width: Array | None
     """(2,) velocity [rad/s] around which the sign of it changes, where it is smoothed."""
 
@@ -62,19 +68,27 @@ class PlanarArm(Model):
         coulomb: bool = False,
         offset: bool = False,
         g: float = 9.81,
+        zero: str = "horizontal",
+        length: float | None = None,
     ):
+        if zero not in ("horizontal", "hanging"):
+            raise ValueError(f"zero is '{zero}': at zero the arm is 'horizontal' or 'hanging'")
+        if length is not None and not (inertia and gravity and np.isfinite(length) and length > 0):
+            raise ValueError(f"length is {length}: it must be above zero, and needs inertia and gravity, which it ties")
         if impedance and viscous:
             raise ValueError("damping_11 and damping_22 are viscous friction already: leave out viscous or impedance")
         self.equilibrium = _equilibrium(equilibrium, impedance)
-        self.g = g
+        self.g, self.zero, self.length = g, zero, length
         chosen = (
             _inertia_columns(inertia)
             | (_impedance_columns(self.equilibrium) if self.equilibrium else {})
-            | _gravity_columns(gravity, g)
+            | _gravity_columns(gravity, g, zero)
             | _joint_columns("viscous_friction", viscous, "dq")
             | _joint_columns("coulomb_friction", coulomb, "sign(dq)")
             | _joint_columns("offset_torque", offset, "1")
         )
+        if length is not None:
+            chosen["gravity_2"] += f" + {length:g} {chosen.pop('inertia_2')}"
         if not chosen:
             raise ValueError("the arm has no parameter left: switch at least one column on")
         self.names, self.columns = tuple(chosen), tuple(chosen.values())
@@ -84,6 +98,11 @@ class PlanarArm(Model):
         self.n_joints = 2
         self.width = None
 
+    def at(self, equilibrium: Num[AnyArray, "2"]) -> PlanarArm:
+        """The same arm with the elastic torque vanishing elsewhere [rad]; under `vmap`, a posture for every trial. (The
+        text of the columns stays.)"""
+        return eqx.tree_at(lambda arm: arm.equilibrium, self, (equilibrium[0], equilibrium[1]))
+
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         """The arm with signs of the velocities that change gradually, within `width` [rad/s] of zero, one per joint."""
         widths = jnp.broadcast_to(jnp.asarray(width), (2,))
@@ -91,7 +110,8 @@ class PlanarArm(Model):
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         sine, cosine = sine_and_cosine(q[1])
-        of_first, of_both = (self.g * sine_and_cosine(angle)[1] for angle in (q[0], q[0] + q[1]))
+        weight = 0 if self.zero == "hanging" else 1
+        of_first, of_both = (self.g * sine_and_cosine(angle)[weight] for angle in (q[0], q[0] + q[1]))
         sign = jnp.sign(dq) if self.width is None else jnp.tanh(dq / self.width)
         zero = jnp.zeros_like(cosine)
         # Every column that an arm can have; the compiler drops those that are not stacked.
@@ -112,6 +132,9 @@ class PlanarArm(Model):
             for name, each in {"damping": dq, "stiffness": away}.items():
                 column |= {f"{name}_1{j + 1}": (each[j], zero) for j in (0, 1)}
                 column |= {f"{name}_2{j + 1}": (zero, each[j]) for j in (0, 1)}
+        if self.length is not None:
+            first, second = column["inertia_2"]
+            column["gravity_2"] = (of_both + self.length * first, of_both + self.length * second)
         return jnp.stack([jnp.stack(column[name]) for name in self.names], axis=-1)
 
 
@@ -260,9 +283,10 @@ def _impedance_columns(equilibrium: tuple[float, float]) -> dict[str, str]:
     }
 
 
-def _gravity_columns(wanted: bool, g: float) -> dict[str, str]:
-    both = f"{g:g} cos(q1 + q2)"
-    return {"gravity_1": f"joint1.{g:g} cos(q/1)", "gravity_2": f"[{both}; {both}]"} if wanted else {}
+def _gravity_columns(wanted: bool, g: float, zero: str) -> dict[str, str]:
+    function = "sin" if zero == "hanging" else "cos"
+    both = f"{g:g} {function}(q1 + q2)"
+    return {"gravity_1": f"joint1.{g:g} {function}(q/1)", "gravity_2": f"[{both}; {both}]"} if wanted else {}
 
 
 def _joint_columns(name: str, wanted: bool, column: str) -> dict[str, str]:

@@ -1,0 +1,120 @@
+"""An arm in the hand of a position-controlled robot that perturbs it: Lakatos et al. 2011, IV-A and IV-B.
+
+The robot imposes the motion, so that it is known exactly and only the force on the hand answers: rigid body, and the
+damping and stiffness of the muscles, which rise when reflexes set in. Where the paper gives no number (impedance,
+noise, strength of the reflexes) the defaults are a **choice**, meant to be swept.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num, PRNGKeyArray
+
+from jaximp.models import ArmGeometry, rigid_body_torque
+from jaximp.trajectories import MinimumJerk, array_field
+from jaximp.types import AnyArray
+
+DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, -1], [-1, 1]]) * 0.05
+"""(6, 2) perturbation amplitudes [rad] of Lakatos et al. 2011, IV-B."""
+LATENCIES = (0.025, 0.05, 0.11)
+"""When the stretch reflex, the spinal reflex and the long-latency reflexes set in [s], ibid., I-B."""
+
+
+class HeldArm(eqx.Module):
+    """The subject's arm, and what the robot measures with."""
+
+    lengths: tuple[float, float] = eqx.field(static=True, default=(0.29, 0.34))
+    """Upper arm and forearm [m]."""
+    inertia: Float[Any, "3"] = array_field(default=(0.26815, 0.08375, 0.07367))
+    """Base inertial parameters xi [kg m^2]; these are the arm of Börner et al. 2020."""
+    damping: Float[Any, "2 2"] = array_field(default=((2.42, 1.20), (1.20, 1.42)))
+    """Before any reflex [N m s/rad]: a choice, a twelfth of the stiffness."""
+    stiffness: Float[Any, "2 2"] = array_field(default=((29.05, 14.37), (14.37, 17.08)))
+    """Before any reflex [N m/rad]: a choice, the mean of Börner et al. 2020."""
+    posture: Float[Any, "2"] = array_field(default=(0.08, 1.0))
+    """Angles at rest [rad]."""
+    hand_force: Float[Any, "2"] = array_field(default=(5.0, 0.0))
+    """What the subject presses with at rest [N], the same torque throughout."""
+    reflex_gain: Float[Any, ""] = array_field(default=0.5)
+    """By which share stiffness and damping have risen when all reflexes are there; each brings a third. A choice."""
+    rise: Float[Any, ""] = array_field(default=0.02)
+    """Time in which each reflex comes in [s]. A choice."""
+    force_noise: Float[Any, ""] = array_field(default=0.05)
+    """Standard deviation of the white noise of each force [N]. A choice."""
+    position_noise: Float[Any, ""] = array_field(default=1e-5)
+    """Standard deviation of the white noise of each position of the hand [m]. A choice."""
+
+    @property
+    def geometry(self) -> ArmGeometry:
+        return ArmGeometry(self.lengths)
+
+    def impedance(self, t: Num[AnyArray, "*t"]) -> tuple[Float[Array, "*t 2 2"], Float[Array, "*t 2 2"]]:
+        """Damping and stiffness at the time `t` [s] after the onset."""
+        set_in = jnp.asarray(t)[..., None] - jnp.asarray(LATENCIES)
+        factor = 1 + self.reflex_gain * jnp.clip(set_in / self.rise, 0, 1).mean(axis=-1)
+        factor = factor[..., None, None]
+        return factor * self.damping, factor * self.stiffness
+
+
+class HeldTrials(eqx.Module):
+    """What the robot measures in T trials of N samples, and the truth behind it."""
+
+    time: Float[Array, " N"]
+    """From the onset of the perturbation [s]."""
+    position: Float[Array, "T N 2"]
+    """Measured: of the hand [m]."""
+    force: Float[Array, "T N 2"]
+    """Measured: on the hand [N]."""
+    angles: Float[Array, "T N 2"]
+    """[rad]."""
+    velocities: Float[Array, "T N 2"]
+    """[rad/s]."""
+    accelerations: Float[Array, "T N 2"]
+    """[rad/s^2]."""
+    torque: Float[Array, "T N 2"]
+    """Of the outside force on the joints, without noise [N m]."""
+
+
+def hold(
+    arm: HeldArm,
+    amplitudes: Num[AnyArray, "T 2"],
+    duration: Num[AnyArray, ""],
+    time: Num[AnyArray, " N"],
+    key: PRNGKeyArray | None = None,
+) -> HeldTrials:
+    """The robot moves the joints by each of the `amplitudes` [rad], on a polynomial of fifth order.
+
+    A pure function: `vmap` over durations, arms and noise keys.
+
+    **Arguments:** `duration` of the movement [s], from the onset on; `time` [s] of the samples, the onset at zero;
+    `key` draws the noise, None leaves it out.
+
+    **Source:** Lakatos et al. 2011, eqs. (9), (16), IV-B.
+    """
+    t = jnp.asarray(time)
+    profile = MinimumJerk(jnp.array([0.0, 1.0]), jnp.asarray(duration, float))(t)
+    away, dq, ddq = (jnp.multiply.outer(x, jnp.asarray(amplitudes)).swapaxes(0, 1) for x in profile)
+    q = arm.posture + away
+    D, K = arm.impedance(t)
+    pressed = arm.geometry.joint_torque(arm.posture, arm.hand_force)
+    muscles = (D * dq[..., None, :] + K * away[..., None, :]).sum(axis=-1)
+    torque = rigid_body_torque(q, dq, ddq, jnp.asarray(arm.inertia)) + muscles + pressed
+    position, force = arm.geometry.forward(q), _hand_force(arm.geometry, q, torque)
+    if key is not None:
+        keys = jax.random.split(key)
+        position += arm.position_noise * jax.random.normal(keys[0], position.shape)
+        force += arm.force_noise * jax.random.normal(keys[1], force.shape)
+    return HeldTrials(t, position, force, q, dq, ddq, torque)
+
+
+def _hand_force(geometry: ArmGeometry, q: Array, torque: Array) -> Array:
+    """The force on the hand [N] that makes these torques, by Cramer's rule: no LAPACK in what runs by the thousand."""
+    J = geometry.jacobian(q)
+    (a, b), (c, d) = (J[..., 0, 0], J[..., 1, 0]), (J[..., 0, 1], J[..., 1, 1])
+    first, second = torque[..., 0], torque[..., 1]
+    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]

@@ -1,0 +1,187 @@
+"""Perturbation trials of an arm: from the position of the hand and the force on it to rows for least squares.
+
+Lakatos et al. 2011, IV-C: joint angles by inverse kinematics, joint torques by `J' F`, both less their steady state
+before the perturbation, filters without phase, derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Num
+
+from jaximp.least_squares import WindowFit, least_squares
+from jaximp.models import ArmGeometry, PlanarArm
+from jaximp.regression import Filters, filtered
+from jaximp.types import AnyArray, Recording
+
+STEADY = 0.02
+"""A command has left its steady state where it differs from it by such a share of its largest difference."""
+
+
+class Trials(eqx.Module):
+    """T trials of one length, cut so that the perturbation begins at the same sample in all of them."""
+
+    angles: Float[Array, "T N 2"]
+    """Of the joints [rad]."""
+    torque: Float[Array, "T N 2"]
+    """Of the outside force on the joints, less its mean before the onset [N m]."""
+    equilibrium: Float[Array, "T 2"]
+    """Mean angles before the onset [rad]."""
+    onset: int = eqx.field(static=True)
+    """Index of the sample at which the perturbation begins."""
+    sample_rate: float = eqx.field(static=True)
+    """[Hz]."""
+
+    def __len__(self) -> int:
+        return len(self.angles)
+
+
+class TrialRows(eqx.Module):
+    """Trials as least squares sees them, trial after trial."""
+
+    W: Float[Array, "T N 2 p"]
+    torque: Float[Array, "T N 2"]
+    """[N m]."""
+    time: Float[Array, " N"]
+    """From the onset [s]."""
+
+
+def joint_trials(
+    geometry: ArmGeometry,
+    position: Num[AnyArray, "T N 2"],
+    force: Num[AnyArray, "T N 2"],
+    onset: int,
+    sample_rate: float,
+) -> Trials:
+    """Angles and torques of the joints from the position of the hand [m] and the force on it [N].
+
+    **Arguments:** all trials begin their perturbation at the sample `onset`; what is before it is the steady state.
+
+    **Raises:** `ValueError` for positions out of reach.
+
+    **Source:** Lakatos et al. 2011, IV-C.
+    """
+    q = geometry.inverse(position)
+    torque = geometry.joint_torque(q, force)
+    steady = slice(0, onset)
+    return Trials(
+        q, torque - torque[:, steady].mean(axis=1, keepdims=True), q[:, steady].mean(axis=1), onset, sample_rate
+    )
+
+
+def read_trials(
+    recordings: Sequence[Recording],
+    geometry: ArmGeometry,
+    onset: float | Sequence[float] | None = None,
+    before: float = 0.1,
+    after: float = 0.5,
+) -> Trials:
+    """Trials from recordings of the hand, one each: joints `("prismatic", "prismatic")`, positions [m], forces [N].
+
+    **Arguments:** `onset` of the perturbation [s] in each recording's own time; where it is not given it is found in
+    the `reference` of the recording, the position or force that was commanded. `before` and `after` [s] are kept around
+    it; the mean of `before` is the steady state.
+
+    **Raises:** `ValueError` that names the trial, for one that has no onset, is too short around it, has gaps there, is
+    no recording of a hand in a plane, or was sampled at another rate.
+    """
+    if not recordings:
+        raise ValueError("there are no trials: give at least one recording")
+    rate = recordings[0].sample_rate
+    onsets = np.broadcast_to(np.nan if onset is None else np.asarray(onset, float), len(recordings))
+    n_before, n_after = round(before * rate), round(after * rate)
+    if n_before < 2 or n_after < 2:
+        raise ValueError(f"{before:g} s before the onset and {after:g} s after it are no two samples each: keep more")
+    position, force = [], []
+    for k, (recording, given) in enumerate(zip(recordings, onsets, strict=True)):
+        name = f"trial {k + 1} ({recording.name})" if recording.name else f"trial {k + 1}"
+        _check_hand(name, recording, rate)
+        start = recording.time[0]
+        first = find_onset(name, recording) if np.isnan(given) else round((given - start) * rate)
+        part = slice(first - n_before, first + n_after)
+        if part.start < 0 or part.stop > len(recording):
+            raise ValueError(
+                f"{name} lasts from {recording.time[0]:g} to {recording.time[-1]:g} s, but {before:g} s before and "
+                f"{after:g} s after its onset at {start + first / rate:g} s are wanted: keep less, or leave it out"
+            )
+        if not recording.valid[part].all():
+            raise ValueError(f"{name} has a gap around its onset at {start + first / rate:g} s: leave it out")
+        position.append(recording.position[part])
+        force.append(recording.torque[part])
+    return joint_trials(geometry, np.stack(position), np.stack(force), n_before, rate)
+
+
+def find_onset(name: str, recording: Recording) -> int:
+    """Index of the last sample at which the commanded position or force is still what it was at the beginning."""
+    command = recording.reference
+    if command is None:
+        raise ValueError(
+            f"{name}: its onset is not known: pass onset=, or map the commanded position or force as the reference"
+        )
+    away = np.abs(command - command[0]).max(axis=1)
+    if not (away > 0).any():
+        raise ValueError(f"{name}: no perturbation was found, its command is constant: leave it out, or pass onset=")
+    return max(0, int(np.argmax(away > STEADY * away.max())) - 1)
+
+
+def _check_hand(name: str, recording: Recording, rate: float) -> None:
+    if recording.joints != ("prismatic", "prismatic"):
+        raise ValueError(
+            f"{name} is not a recording of a hand in a plane: load it with joint='prismatic', two columns of the "
+            "position and two of the force"
+        )
+    if abs(recording.sample_rate - rate) > 1e-3 * rate:
+        raise ValueError(
+            f"{name} was sampled at {recording.sample_rate:g} Hz and trial 1 at {rate:g} Hz: resample one of them"
+        )
+
+
+def regress_trials(model: PlanarArm, trials: Trials, filters: Filters) -> TrialRows:
+    """Filter every trial and evaluate the model on it, with the trial's own equilibrium.
+
+    **Source:** Lakatos et al. 2011, eqs. (12), (13).
+    """
+
+    def one(q: Array, torque: Array, equilibrium: Array) -> tuple[Array, Array]:
+        return filtered(model.at(equilibrium), filters, trials.sample_rate, q, torque)[:2]
+
+    W, torque = eqx.filter_jit(jax.vmap(one))(trials.angles, trials.torque, trials.equilibrium)
+    n = trials.angles.shape[1]
+    time = (jnp.arange(n)[:: filters.decimate] - trials.onset) / trials.sample_rate
+    return TrialRows(W, torque, time)
+
+
+def fit_trials(
+    rows: TrialRows,
+    observed: float | Num[AnyArray, ""],
+    counts: Bool[AnyArray, " T"] | None = None,
+    noise: Num[AnyArray, " L"] | None = None,
+) -> WindowFit:
+    """One set of parameters from the first `observed` seconds after the onset of all trials, eq. (14).
+
+    **Arguments:** `counts` (T,) False for trials that are held out; `noise` the autocovariance of a row's noise, as in
+    `least_squares`.
+
+    **Raises:** `ValueError` for fewer rows than parameters.
+    """
+    T, N, n, p = rows.W.shape
+    if T * N * n < p:
+        raise ValueError(f"{T} trials of {N} samples cannot determine {p} parameters: record more, or observe longer")
+    # Half a sample of grace: times are multiples of the sampling interval only up to rounding.
+    grace = (rows.time[1] - rows.time[0]) / 2
+    inside = (rows.time >= -grace) & (rows.time < observed + grace)
+    valid = jnp.broadcast_to(inside, (T, N)) & (True if counts is None else jnp.asarray(counts)[:, None])
+    shape = (T * N, n)
+    valid = jnp.broadcast_to(valid.reshape(-1, 1), shape)
+    return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, noise)
+
+
+def directions_span(amplitudes: Num[AnyArray, "T 2"]) -> float:
+    """How well the directions of the perturbations span the plane: smallest over largest singular value, 0 to 1."""
+    singular = np.linalg.svd(np.asarray(amplitudes, float), compute_uv=False)
+    return float(singular[-1] / singular[0]) if len(singular) == 2 and singular[0] > 0 else 0.0
