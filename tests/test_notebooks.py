@@ -46,10 +46,13 @@ def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     kernel = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=specs)
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(notebook, km=kernel, timeout=600, resources={"metadata": {"path": str(tmp_path)}})
+    failure = ""
     try:
-        client.execute()
+        client.execute(cleanup_kc=True)  # ends the kernel, too
     except CellExecutionError as error:
-        pytest.fail(COLOURS.sub("", str(error)), pytrace=False)
+        failure = COLOURS.sub("", str(error))
+    if failure:
+        pytest.fail(failure, pytrace=False)
     assert not warned(notebook)
     # The last cell checks what the text says.
     assert "assert" in notebook.cells[-1].source
