@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint studies lock clean
+.PHONY: setup demo test lint studies notebooks lock clean
 
 setup: .venv/ready
 
@@ -27,6 +27,10 @@ test: lint
 # The slow studies behind the README's tables; their results stand in experiments/results.
 studies: setup
 	for study in experiments/*.py experiments/benchmarks/*.py; do $(BIN)/python $$study || exit 1; done
+
+# Runs the notebooks and keeps them with their results.
+notebooks: setup
+	$(BIN)/jupyter-execute --inplace --NotebookClient.record_timing=False notebooks/*.ipynb
 
 # Pinned versions for every supported Python, without any download address.
 lock: setup

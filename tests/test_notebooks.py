@@ -1,0 +1,72 @@
+"""Every notebook runs from top to bottom in a fresh kernel of this interpreter, and is kept with its results."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+from jupyter_client.kernelspec import KernelSpecManager
+from jupyter_client.manager import AsyncKernelManager
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LARGEST = 600_000
+"""Of a notebook with its figures [bytes]."""
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
+
+
+def outputs(notebook: Any, kind: str) -> list[Any]:
+    """All outputs of one kind: `stream`, `error`, `display_data`, `execute_result`."""
+    cells = (cell for cell in notebook.cells if cell.cell_type == "code")
+    return [output for cell in cells for output in cell.outputs if output.output_type == kind]
+
+
+def warned(notebook: Any) -> list[str]:
+    return [output.text for output in outputs(notebook, "stream") if output.name == "stderr"]
+
+
+def test_there_are_notebooks() -> None:
+    assert NOTEBOOKS
+
+
+@every_notebook
+def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "MPLCONFIGDIR"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    # Without folders to look in, the one kernel known is that of the running interpreter.
+    specs = KernelSpecManager(kernel_dirs=[])
+    kernel = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=specs)
+    notebook = nbformat.read(path, as_version=4)
+    client = NotebookClient(notebook, km=kernel, timeout=600, resources={"metadata": {"path": str(tmp_path)}})
+    failure = ""
+    try:
+        client.execute(cleanup_kc=True)  # ends the kernel, too
+    except CellExecutionError as error:
+        failure = COLOURS.sub("", str(error))
+    if failure:
+        pytest.fail(failure, pytrace=False)
+    assert not warned(notebook)
+    # The last cell checks what the text says.
+    assert "assert" in notebook.cells[-1].source
+    assert "all of it holds" in notebook.cells[-1].outputs[0].text
+
+
+@every_notebook
+def test_it_is_kept_with_its_results(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == "code"]
+    assert counts == list(range(1, len(counts) + 1)), "run `make notebooks`"
+    assert not outputs(notebook, "error")
+    assert not warned(notebook)
+    assert path.stat().st_size < LARGEST
+    text = path.read_text(encoding="utf-8")
+    assert not [word for word in ("/home/", "/tmp/", "/Users/", "site-packages") if word in text]
