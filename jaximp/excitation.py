@@ -54,6 +54,8 @@ BATCH = 8
 """Starts that are minimised together; several batches at a time, one on each core."""
 ACTIVE = 0.999
 """A limit is active where the motion reaches such a share of it."""
+COLLINEAR = 1e6
+"""From such a condition number on, parameters cannot be told apart."""
 INFEASIBLE = 50.0
 """Objective where not even rest is allowed: above the logarithm of any condition number."""
 
@@ -119,6 +121,8 @@ class Design:
     """Length of the windows that were designed for [s]."""
     moved: Model | None = None
     """The model of everything that is moved, if that is more than is to be identified."""
+    parameter: str | None = None
+    """Whose standard error was made small."""
 
     def in_words(self) -> list[str]:
         """What was found, a line for each fact."""
@@ -126,14 +130,24 @@ class Design:
         if math.isnan(self.lower_bound):
             lines.append(f"how far above the least possible: not known ({self.bound_source})")
         else:
-            above = max(0.0, self.condition / self.lower_bound - 1)
             source = f"{self.bound_source}; it knows no limits"
-            lines.append(f"{100 * above:.2g} % above the lower bound {self.lower_bound:.4g} ({source})")
+            lines.append(
+                f"{_above(self.condition, self.lower_bound)} the lower bound {self.lower_bound:.4g} ({source})"
+            )
         if self.window is not None:
-            lines.append(f"in the worst window of {self.window:g} s: {self.worst_condition:.4g}")
-        if self.objective not in ("condition",):
+            lines.append(f"in the worst window of {self.window:.4g} s: {self.worst_condition:.4g}")
+        if self.objective == "stderr":
+            unit = self.model.units[self.model.names.index(self.parameter or "")]
+            lines.append(f"standard error of {self.parameter} for torque noise of 1 N m: {self.value:.4g} {unit}")
+        elif self.objective != "condition":
             lines.append(f"{OBJECTIVES[self.objective]}: {self.value:.4g}")
+        if not self.worst_condition < COLLINEAR:
+            lines.append("not all parameters can be told apart: use another objective, or a smaller model")
         lines.append("limits reached: " + (", ".join(self.active) or "none"))
+        if self.objective == "condition" and not self.active and self.limits != Limits():
+            lines.append(
+                "a larger motion would keep the limits: the condition number does not ask for size, stderr does"
+            )
         return lines
 
     def sliding_condition(self, length: float) -> tuple[Numbers, Numbers]:
@@ -163,6 +177,14 @@ class Design:
         if self.parameters is not None:
             found["torque"] = np.asarray((self.moved or self.model).torque(self.parameters, q, dq, ddq))
         return found
+
+
+def _above(condition: float, bound: float) -> str:
+    """How far a condition number is above its bound, in words."""
+    share = condition / bound - 1
+    if share < 1e-4:
+        return "at"
+    return f"{100 * share:.2g} % above" if share < 1 else f"{share + 1:.2g} times"
 
 
 class _Problem(eqx.Module):
@@ -266,7 +288,7 @@ def design_excitation(
     return Design(
         series, model, condition, worst, bound, source, period, objective, _in_units(problem, value), limits,
         _active(problem, series), conditions, None if parameters is None else np.asarray(parameters, float), window,
-        moved,
+        moved, parameter,
     )  # fmt: skip
 
 

@@ -198,6 +198,17 @@ def test_a_standard_error_is_that_of_the_measurements() -> None:
     assert design.value == pytest.approx(np.sqrt(np.linalg.inv(W.T @ W)[2, 2]), rel=1e-6)
 
 
+def test_a_design_says_what_it_does_not_do() -> None:
+    """Holding still at the highest angle is best for a stiffness alone, and leaves inertia and damping unknown."""
+    limits = Limits(position=(-0.5, 0.5))
+    still = design_excitation(HUMAN, limits=limits, objective="stderr", parameter="stiffness", starts=4)
+    assert any("not all parameters can be told apart" in line for line in still.in_words())
+    assert any(line.startswith("standard error of stiffness") and line.endswith("N m/rad") for line in still.in_words())
+    offset = design_excitation(HumanJoint(), limits=Limits(position=(-5.0, 5.0)), starts=8)
+    assert any("larger motion" in line for line in offset.in_words())
+    assert any(line.startswith("at the lower bound 1.732") for line in offset.in_words())
+
+
 def test_a_mean_position_is_kept() -> None:
     limits = Limits(position=(-0.5, 0.5))
     design = design_excitation(HUMAN, limits=limits, window=2.0, mean=0.1, starts=4)

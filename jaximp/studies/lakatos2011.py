@@ -8,11 +8,7 @@ threshold is the range of what came out of them.
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,15 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from jaximp import plots
 from jaximp.job import FilterSettings
 from jaximp.least_squares import variance_accounted_for
 from jaximp.models import PlanarArm
 from jaximp.regression import Filters, design_filters
-from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
-from jaximp.trajectories import MinimumJerk, SixthOrder
+from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold
 from jaximp.trials import TrialRows, fit_trials, joint_trials, regress_trials
-from jaximp.trust import TrustLimits, matrix_criteria
 from jaximp.types import Numbers, Progress
 
 RATE = 1000.0  # Hz
@@ -116,7 +109,7 @@ def sweep(arms: HeldArm, keys: PRNGKeyArray, durations: Array, inertia: Array) -
         rows = rows_of(arm, hold(arm, amplitudes(), duration, times(), key))
         observed = duration + OBSERVED
         D, K = arm.impedance(jnp.asarray(times()))
-        during = jnp.asarray((times() >= 0))[:, None, None] * (times()[:, None, None] <= observed)
+        during = jnp.asarray(times() >= 0)[:, None, None] * (times()[:, None, None] <= observed)
         full = _estimate(rows, observed, 0)
         rigid = rows.W[..., :3] @ inertia
         reduced = _estimate(TrialRows(rows.W[..., 3:], rows.torque - rigid, rows.time), observed, 3)
