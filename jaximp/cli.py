@@ -56,6 +56,7 @@ class Paper(StrEnum):
     """What can be reproduced."""
 
     tout2023 = "tout2023"
+    lakatos2011 = "lakatos2011"
 
 
 def main() -> None:
@@ -186,10 +187,10 @@ def simulate(
 def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
     """Redraw a paper's figures and tables; tables.json holds the numbers beside the paper's."""
     from jaximp.outputs import new_folder
-    from jaximp.studies import tout2023
 
+    study = import_module(f"jaximp.studies.{paper.value}")
     with new_folder(out, force) as folder, _progress(f"reproducing {paper.value}") as progress:
-        tout2023.reproduce(folder, progress)
+        study.reproduce(folder, progress)
     typer.echo(f"figures and tables: {out}")
 
 

@@ -19,6 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report", "check"),
     ("plots",),
     ("identify",),
+    ("trials", "perturbations"),
     ("regression",),
     ("design",),
     ("job",),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import wraps
 from io import BytesIO
 from typing import Any, ParamSpec, TypeVar
@@ -167,6 +167,8 @@ class Panel:
     """Label, x and y of each; the first is drawn in black, as what the others are held against."""
     limits: tuple[float, float] | None = None
     log: bool = False
+    bands: Mapping[str, tuple[Numbers, Numbers]] = field(default_factory=dict)
+    """Lower and upper end beside the line of a label."""
 
 
 @styled
@@ -178,6 +180,8 @@ def curves(panels: Sequence[Panel]) -> Figure:
         for k, (label, x, y) in enumerate(panel.lines):
             color, style = (BLACK, "-") if k == 0 else LINES[:4][(k - 1) % 4]
             draw_line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if k else 1.3)
+            if label in panel.bands:
+                draw_band(axis, x, *panel.bands[label], color=color, alpha=0.2, linewidth=0)
         if panel.limits is not None:
             axis.set_ylim(*panel.limits)
         if panel.log:
