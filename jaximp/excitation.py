@@ -6,7 +6,7 @@ is exact, and all starts descend at once.
 
 **Every motion on the way is feasible.** The optimiser's numbers are a direction: the motion starts from rest at its
 offset and goes as far that way as the limits allow. For all limits but the torque's that is a division; the torque's is
-a root, found by bisection and differentiated as an implicit function. Nothing is penalised, no weight is chosen.
+a root, which is found and then differentiated as an implicit function. Nothing is penalised, no weight is chosen.
 
 **Objectives** see the Gram matrix `W'W` alone, p by p, of the period or of every window (`objectives.py`).
 """
@@ -48,7 +48,9 @@ FINER = 10
 STAGES = ((0.1, 20.0), (0.01, 200.0))
 """While a motion is designed, dry friction changes its sign within such a share of the largest velocity, and the worst
 window is a smooth maximum of such sharpness."""
-BISECTIONS = 40
+TOUCHING = 1e-12
+"""A torque this far below its limit, as a share of it, has reached it."""
+MOST_STEPS = 60
 ROUNDING = 1e-12
 BATCH = 8
 """Starts that are minimised together; several batches at a time, one on each core."""
@@ -446,19 +448,42 @@ def _within_torque(
         return _torque_share(problem, _times(series, factor), t, smooth).max() - 1
 
     fixed = jax.lax.stop_gradient(series)
-
-    def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = (low + high) / 2
-        fits = excess(middle, fixed) <= 0
-        return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
-
-    all_of_it = excess(jnp.ones(()), fixed) <= 0
-    root = jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros(()), jnp.ones(())))[0]
-    slope = jax.lax.stop_gradient(jax.grad(excess)(root, fixed))
+    at_rest = _torque_share(problem, _times(series, 0.0), t[:1], smooth).max() - 1
+    at_most = excess(jnp.ones(()), fixed)
+    root = _root(lambda factor: excess(factor, fixed), jax.lax.stop_gradient(at_rest), at_most)
+    slope = jax.lax.stop_gradient(jax.jvp(lambda factor: excess(factor, fixed), (root,), (jnp.ones(()),))[1])
     step = excess(root, series) / jnp.where(slope == 0, 1, slope)
-    factor = jnp.where(all_of_it, 1.0, root - (step - jax.lax.stop_gradient(step)))
-    return _times(series, factor), jnp.maximum(excess(jnp.zeros(()), series), 0)
+    factor = jnp.where(at_most <= 0, 1.0, root - (step - jax.lax.stop_gradient(step)))
+    return _times(series, factor), jnp.maximum(at_rest, 0)
+
+
+def _root(excess: Callable[[Array], Array], at_zero: Array, at_one: Array) -> Array:
+    """Where a function of a number between 0 and 1 rises above zero, or just below; regula falsi, after Illinois.
+
+    Nothing is done where it stays below: most motions keep the limit of the torque.
+    """
+
+    def go_on(state: tuple[Array, ...]) -> Array:
+        *_, done, count = state
+        return (at_zero < 0) & (at_one > 0) & ~done & (count < MOST_STEPS)
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, at_low, high, at_high, _, count = state
+        middle = (low * at_high - high * at_low) / (at_high - at_low)
+        value = excess(middle)
+        below = value <= 0
+        # The end that stays counts half the next time, so that both ends close in.
+        return (
+            jnp.where(below, middle, low),
+            jnp.where(below, value, at_low / 2),
+            jnp.where(below, high, middle),
+            jnp.where(below, at_high / 2, value),
+            below & (value > -TOUCHING),
+            count + 1,
+        )
+
+    start = (jnp.zeros(()), at_zero, jnp.ones(()), at_one, jnp.array(False), jnp.zeros((), int))
+    return jax.lax.while_loop(go_on, step, start)[0]
 
 
 def _torque_share(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None) -> Array:
