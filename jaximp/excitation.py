@@ -14,7 +14,6 @@ a root, which is found and then differentiated as an implicit function. Nothing 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaximp.bounds import condition_bound
+from jaximp.chunks import cores
 from jaximp.models import Model
 from jaximp.objectives import log_condition, log_sigma_min, log_stderr, log_volume
 from jaximp.optimise import METHODS, minimise, onto_polytope
@@ -463,11 +463,13 @@ def _root(excess: Callable[[Array], Array], at_zero: Array, at_one: Array) -> Ar
     Nothing is done where it stays below: most motions keep the limit of the torque.
     """
 
-    def go_on(state: tuple[Array, ...]) -> Array:
+    def go_on(state: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
         *_, done, count = state
         return (at_zero < 0) & (at_one > 0) & ~done & (count < MOST_STEPS)
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def step(
+        state: tuple[Array, Array, Array, Array, Array, Array],
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
         low, at_low, high, at_high, _, count = state
         middle = (low * at_high - high * at_low) / (at_high - at_low)
         value = excess(middle)
@@ -563,8 +565,7 @@ def _random_starts(problem: _Problem, count: int, seed: int) -> Array:
     spectrum = np.arange(1, h + 1) ** random.uniform(-1, 1, (count, 1, n, 1))
     coefficients = random.normal(size=(count, 2, n, h)) * spectrum
     x = np.concatenate([_rests(problem, count, random), coefficients.reshape(count, -1)], axis=1)
-    t = problem.instants()
-    reached = np.asarray(eqx.filter_jit(jax.vmap(lambda x: _reached(problem, _direction(problem, x), t).max()))(x))
+    reached = np.asarray(_farthest(problem, jnp.asarray(x)))
     wanted = np.where(reached > 0, random.uniform(0.5, 1.5, count) / np.where(reached > 0, reached, 1), 1.0)
     x[:, n:] *= wanted[:, None]
     return jnp.asarray(x)
@@ -575,12 +576,7 @@ def _rests(problem: _Problem, count: int, random: np.random.Generator) -> Number
     if problem.parameters is None or not np.isfinite(problem.most[-1]).any():
         return 0.5 * x[:count]
     still = np.zeros((len(x), 2 * problem.n * problem.harmonics))
-    t = jnp.zeros(1)
-
-    def share(x: Array) -> Array:
-        return _torque_share(problem, _direction(problem, x), t, None)
-
-    shares = np.asarray(eqx.filter_jit(jax.vmap(share))(jnp.asarray(np.concatenate([x, still], axis=1))))
+    shares = np.asarray(_shares_at_rest(problem, jnp.asarray(np.concatenate([x, still], axis=1))))
     fits = (shares < 1).all(axis=1)
     if not fits.any():
         joint = int(shares.min(axis=0).argmax())
@@ -591,10 +587,23 @@ def _rests(problem: _Problem, count: int, random: np.random.Generator) -> Number
     return np.resize(x[fits], (count, problem.n))
 
 
+@eqx.filter_jit
+def _farthest(problem: _Problem, x: Array) -> Array:
+    """How far each motion goes, as a share of the limit that it comes closest to."""
+    t = problem.instants()
+    return jax.vmap(lambda x: _reached(problem, _direction(problem, x), t).max())(x)
+
+
+@eqx.filter_jit
+def _shares_at_rest(problem: _Problem, x: Array) -> Array:
+    return jax.vmap(lambda x: _torque_share(problem, _direction(problem, x), jnp.zeros(1), None))(x)
+
+
 def _descend(problem: _Problem, x: Array, method: str, progress: Progress) -> Array:
     """All starts, in batches of one size, on as many cores as there are."""
     polytope = _linear_limits(problem) if method == "projected_gradient" else None
-    batches = [jnp.resize(x[k : k + BATCH], (BATCH, x.shape[1])) for k in range(0, len(x), BATCH)]
+    size = min(BATCH, -(-len(x) // cores()))
+    batches = [jnp.resize(x[k : k + size], (size, x.shape[1])) for k in range(0, len(x), size)]
     done = 0
 
     def descend(batch: Array) -> Array:
@@ -605,7 +614,7 @@ def _descend(problem: _Problem, x: Array, method: str, progress: Progress) -> Ar
             progress(done / (len(STAGES) * len(batches)))
         return jax.block_until_ready(batch)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         return jnp.concatenate(list(pool.map(descend, batches)))[: len(x)]
 
 
