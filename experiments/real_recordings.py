@@ -60,6 +60,31 @@ REFLEX = ANKLE.replace('"ankle/z_df2.csv"', '"ankle/z_pf.npz"').replace(
 )
 
 
+PENDULUM = """
+[recording]
+file = "double_pendulum/FILE"
+time = "time"
+position = ["pos1", "pos2"]
+torque = ["tau1", "tau2"]
+[model.arm]
+gravity = true
+zero = "hanging"
+length = 0.3
+rotor = true
+viscous = true
+coulomb = true
+[filter]
+position_cutoff = 20
+position_order = 4
+decimation_cutoff = 10
+[window]
+length = 5
+min_velocity = 0.1
+"""
+OWNERS = {"I1 + m2 l1^2 + rotor": 0.1106, "m2 r2": 0.1111, "I2": 0.0239, "m1 r1 + m2 l1": 0.3491}
+"""The owners' own fit."""
+
+
 def emps() -> dict[str, Any]:
     """Whole recording and windows of 5 s against the published parameters."""
     job = parse_job(EMPS, DATA)
@@ -108,11 +133,56 @@ def ankle(text: str) -> dict[str, Any]:
     }
 
 
+def pendulum() -> dict[str, Any]:
+    """All four files together, and each predicted from the other three."""
+    files = sorted(path.name for path in (DATA / "double_pendulum").glob("*.csv"))
+    parts = []
+    for name in files:
+        job = parse_job(PENDULUM.replace("FILE", name), DATA)
+        recording = job.load()
+        model = job.models(recording.joints)[0]
+        assert model is not None
+        filters = design_filters(job.filter, recording.sample_rate)
+        rows = regress(model, recording, job, filters)
+        parts.append((np.asarray(rows.W), np.asarray(rows.torque), rows.valid))
+    noise = noise_of_rows(job, recording, filters)
+
+    def fit(chosen: list[int]) -> Any:
+        W, torque, valid = (np.concatenate([parts[k][i] for k in chosen]) for i in range(3))
+        return least_squares(W, torque, valid, noise)
+
+    together = fit(list(range(len(files))))
+    theta = dict(zip(model.names, np.asarray(together.theta), strict=True))
+    found = {
+        "I1 + m2 l1^2 + rotor": theta["inertia_1"] - theta["inertia_3"],
+        "m2 r2": theta["gravity_2"],
+        "I2": theta["inertia_3"],
+        "m1 r1 + m2 l1": theta["gravity_1"],
+    }
+    held_out = {}
+    for k, name in enumerate(files):
+        W, torque, valid = parts[k]
+        residual = torque - W @ np.asarray(fit([j for j in range(len(files)) if j != k]).theta)
+        held_out[name] = float(np.linalg.norm(residual[valid]) / np.linalg.norm(torque[valid]))
+    estimates = identify(job)[0]
+    residual = np.concatenate([(torque - W @ np.asarray(together.theta))[valid] for W, torque, valid in parts])
+    return {
+        name: {"owners": OWNERS[name], "measured": float(x), "relative_difference": float(x / OWNERS[name] - 1)}
+        for name, x in found.items()
+    } | {
+        "parameters": {name: float(x) for name, x in theta.items()},
+        "stderr": dict(zip(model.names, np.asarray(together.stderr).tolist(), strict=True)),
+        "residual": float(np.linalg.norm(residual) / np.linalg.norm(np.concatenate([t[v] for _, t, v in parts]))),
+        "residual_of_the_file_that_was_held_out": held_out,
+        "windows_of_5_s_of_the_last_file": estimates.verdicts.counts(),
+    }
+
+
 if __name__ == "__main__":
     if not DATA.is_dir():
         print(f"skipped: no real recordings in {DATA.name!r}; set JAXIMP_DATA to their folder")
         sys.exit(0)
-    results = {"emps": emps(), "ankle z_df2": ankle(ANKLE), "ankle z_pf": ankle(REFLEX)}
+    results = {"emps": emps(), "ankle z_df2": ankle(ANKLE), "ankle z_pf": ankle(REFLEX), "double pendulum": pendulum()}
     text = json.dumps(results, indent=1)
     (HERE / "results" / "real_recordings.json").write_text(text + "\n")
     print(text)

@@ -92,6 +92,8 @@ class DesignJob:
     def _made(self, whom: tuple[str, ...], joints: int) -> Model:
         """Robot, human, or both with the columns that they share merged; joints side by side."""
         robot, human = self.model.robot, self.model.human
+        if self.model.arm is not None:
+            return self.model.arm.make()
         made: list[Model] = [] if robot is None or "robot" not in whom else [RobotJoint(**vars(robot))]
         made += [] if human is None or "human" not in whom else [HumanJoint(**vars(human))]
         one = made[0] if len(made) == 1 else combine(*made)
@@ -126,8 +128,8 @@ def parse_design_job(text: str) -> DesignJob:
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"[{name}] must be a table: a number for every parameter")
     model = model_settings(tables["model"])
-    if model.robot is None and model.human is None:
-        raise ValueError("[model] is empty: write human = true, or robot = true, or both")
+    if model == ModelSettings():
+        raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
     design = settings(DesignSettings, tables.get("design", {}), "design")
     for name, choices in (("objective", OBJECTIVES), ("method", METHODS)):
         if getattr(design, name) not in choices:
@@ -139,6 +141,8 @@ def parse_design_job(text: str) -> DesignJob:
         raise ValueError(
             f"design.identify is '{design.identify}': it must be 'human' or 'robot', and the model must have both"
         )
+    if model.arm is not None and design.joints != 1:
+        raise ValueError("design.joints counts models of one joint side by side: leave it out, an arm has two joints")
     if design.joints < 1:
         raise ValueError(f"design.joints is {design.joints}: there must be at least one")
     encoder = tables.get("encoder")

@@ -153,7 +153,7 @@ def in_windows(
 
     **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code.
     """
-    if prepared.recording.n_joints > 1:
+    if isinstance(prepared.model, Joints):
         return [_joint_by_joint(job, prepared, progress, longest)]
     rows, noise = prepared.rows, prepared.noise
     place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
@@ -342,7 +342,7 @@ def _estimates(
     verdicts = judge(
         fit,
         model.names,
-        place.counted,
+        place.counted * model.n_joints,
         _parameter_scale(rows),
         prepared.column_noise,
         threshold,

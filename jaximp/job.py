@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design_files import read_trajectory
-from jaximp.models import HumanJoint, Joints, Model, RobotJoint
+from jaximp.models import HumanJoint, Joints, Model, PlanarArm, RobotJoint
 from jaximp.payload import METHODS
 from jaximp.recordings import recording_from_mapping
 from jaximp.settings import check_keys, checked, optional, read, settings
@@ -82,11 +82,37 @@ class HumanSettings:
 
 
 @dataclass(frozen=True)
+class ArmSettings:
+    """Columns of `models.PlanarArm`: two joints that share their parameters."""
+
+    equilibrium: list[float] | None = None
+    """Two angles [rad]; damping and stiffness about them are identified where it is given."""
+    inertia: bool = True
+    gravity: bool = False
+    viscous: bool = False
+    coulomb: bool = False
+    offset: bool = False
+    rotor: bool = False
+    """The inertia of the second motor's rotor behind its gear."""
+    g: float = 9.81
+    zero: str = "horizontal"
+    """Where gravity acts: at angles of zero the arm is `horizontal`, or `hanging`."""
+    length: float | None = None
+    """Of the upper arm [m]: ties inertia to gravity."""
+
+    def make(self) -> PlanarArm:
+        """The model."""
+        return PlanarArm(**vars(self), impedance=self.equilibrium is not None)
+
+
+@dataclass(frozen=True)
 class ModelSettings:
-    """What is identified: a human joint, a robot joint, or the human in the robot by some of the four methods."""
+    """What is identified: a human joint, a robot joint, or the human in the robot by some of the four methods; or an
+    arm of two joints."""
 
     human: HumanSettings | None = None
     robot: RobotSettings | None = None
+    arm: ArmSettings | None = None
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
 
@@ -131,8 +157,16 @@ class Job:
         return [self.folder / name for name in (*names, self.design) if name is not None]
 
     def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
-        """Robot and human model for a recording with these joints; several joints stand side by side."""
+        """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
+        one model of two joints, stands in the robot's place."""
         robot, human = self.model.robot, self.model.human
+        if self.model.arm is not None:
+            if joints != ("revolute", "revolute"):
+                raise ValueError(
+                    f"model.arm has two revolute joints, but the recording {' and '.join(joints)}: map two columns of "
+                    "the position and two of the torque"
+                )
+            return self.model.arm.make(), None
         robots = None if robot is None else [RobotJoint(**vars(robot), joint=joint) for joint in joints]
         humans = None if human is None else [HumanJoint(**vars(human), joint=joint) for joint in joints]
         one_or_joints = [
@@ -180,19 +214,24 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
 def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
-    check_keys(table, ["human", "robot", "methods"], "[model]")
+    check_keys(table, ["human", "robot", "arm", "methods"], "[model]")
     robot = optional(RobotSettings, table.get("robot", False), "model.robot")
     human = optional(HumanSettings, table.get("human", False), "model.human")
+    arm = optional(ArmSettings, table.get("arm", False), "model.arm")
+    if arm is not None:
+        if robot is not None or human is not None:
+            raise ValueError("model.arm stands alone: leave out model.robot and model.human")
+        arm.make()  # refuses what does not go together
     methods = table.get("methods", [1])
     methods = methods if isinstance(methods, list) else [methods]
     if not methods or any(type(method) is not int or method not in METHODS for method in methods):
         raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
-    return ModelSettings(human, robot, tuple(dict.fromkeys(methods)))
+    return ModelSettings(human, robot, arm, tuple(dict.fromkeys(methods)))
 
 
 def _check_values(job: Job) -> None:
-    if job.model.human is None and job.model.robot is None:
-        raise ValueError("[model] is empty: write human = true, or robot = true, or both")
+    if job.model.human is None and job.model.robot is None and job.model.arm is None:
+        raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
     both = job.model.human is not None and job.model.robot is not None
     if both and job.robot_recording is None:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
@@ -226,7 +265,7 @@ def _check_values(job: Job) -> None:
     for name in ("position_order", "decimation_order", "high_pass_order"):
         if not 1 <= getattr(job.filter, name) <= 12:
             raise ValueError(f"filter.{name} is {getattr(job.filter, name)}: it must lie between 1 and 12")
-    offsets = [part.offset for part in (job.model.human, job.model.robot) if part is not None]
+    offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm) if part is not None]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
 

@@ -17,10 +17,16 @@ from jaxtyping import Array, Bool, Float, Num
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import ArmGeometry, PlanarArm
 from jaximp.regression import Filters, filtered
-from jaximp.types import AnyArray, Recording
+from jaximp.types import AnyArray, Numbers, Recording
 
 STEADY = 0.02
 """A command has left its steady state where it differs from it by such a share of its largest difference."""
+
+
+STRAIGHT = 0.05
+"""Angle of the elbow [rad] below which an arm counts as straight."""
+FLAT = 0.05
+"""Smallest over largest singular value of the perturbations from which on they span the plane."""
 
 
 class Trials(eqx.Module):
@@ -49,6 +55,8 @@ class TrialRows(eqx.Module):
     """[N m]."""
     time: Float[Array, " N"]
     """From the onset [s]."""
+    peaks: Float[Array, "T 2"]
+    """Displacement of the joints [rad] where each trial is farthest from its equilibrium."""
 
 
 def joint_trials(
@@ -62,11 +70,12 @@ def joint_trials(
 
     **Arguments:** all trials begin their perturbation at the sample `onset`; what is before it is the steady state.
 
-    **Raises:** `ValueError` for positions out of reach.
+    **Raises:** `ValueError` for positions out of reach, and for an elbow that is nearly straight or folded.
 
     **Source:** Lakatos et al. 2011, IV-C.
     """
     q = geometry.inverse(position)
+    _check_elbow(q)
     torque = geometry.joint_torque(q, force)
     steady = slice(0, onset)
     return Trials(
@@ -153,7 +162,9 @@ def regress_trials(model: PlanarArm, trials: Trials, filters: Filters) -> TrialR
     W, torque = eqx.filter_jit(jax.vmap(one))(trials.angles, trials.torque, trials.equilibrium)
     n = trials.angles.shape[1]
     time = (jnp.arange(n)[:: filters.decimate] - trials.onset) / trials.sample_rate
-    return TrialRows(W, torque, time)
+    away = trials.angles - trials.equilibrium[:, None]
+    farthest = jnp.argmax((away**2).sum(axis=-1), axis=1)
+    return TrialRows(W, torque, time, away[jnp.arange(len(away)), farthest])
 
 
 def fit_trials(
@@ -167,11 +178,13 @@ def fit_trials(
     **Arguments:** `counts` (T,) False for trials that are held out; `noise` the autocovariance of a row's noise, as in
     `least_squares`.
 
-    **Raises:** `ValueError` for fewer rows than parameters.
+    **Raises:** `ValueError` for fewer rows than parameters, and for directions that do not span the plane.
     """
     T, N, n, p = rows.W.shape
     if T * N * n < p:
         raise ValueError(f"{T} trials of {N} samples cannot determine {p} parameters: record more, or observe longer")
+    if not isinstance(rows.peaks, jax.core.Tracer) and not isinstance(counts, jax.core.Tracer):
+        _check_directions(np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)])
     # Half a sample of grace: times are multiples of the sampling interval only up to rounding.
     grace = (rows.time[1] - rows.time[0]) / 2
     inside = (rows.time >= -grace) & (rows.time < observed + grace)
@@ -181,7 +194,23 @@ def fit_trials(
     return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, noise)
 
 
-def directions_span(amplitudes: Num[AnyArray, "T 2"]) -> float:
-    """How well the directions of the perturbations span the plane: smallest over largest singular value, 0 to 1."""
-    singular = np.linalg.svd(np.asarray(amplitudes, float), compute_uv=False)
-    return float(singular[-1] / singular[0]) if len(singular) == 2 and singular[0] > 0 else 0.0
+def _check_directions(peaks: Numbers) -> None:
+    """Perturbations along one line tell nothing of the stiffness across it."""
+    singular = np.linalg.svd(peaks, compute_uv=False)
+    if len(peaks) < 2 or not singular[-1] > FLAT * singular[0]:
+        raise ValueError(
+            f"the directions of {len(peaks)} trials do not span the plane of the two joints: perturb in at least two "
+            "directions"
+        )
+
+
+def _check_elbow(q: Array) -> None:
+    if isinstance(q, jax.core.Tracer):
+        return
+    bend = np.abs(np.sin(np.asarray(q)[..., 1])).min(axis=1)
+    if (bend < STRAIGHT).any():
+        worst = int(np.nanargmin(bend))
+        raise ValueError(
+            f"trial {worst + 1}: the elbow comes within {bend[worst]:.2g} rad of straight or folded, where the hand "
+            "does not tell the angles of the joints: choose another posture, or check the lengths of the arm"
+        )

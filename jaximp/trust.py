@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 from numpy.typing import NDArray
 
-from jaximp.least_squares import SlidingFit
+from jaximp.least_squares import Fit, SlidingFit, WindowFit
 from jaximp.types import AnyArray, Numbers, nearest
 
 TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
@@ -136,6 +136,87 @@ def matrix_criteria(
     gone = np.where(known, 0.0, np.nan)
     return MatrixCriteria(
         eigenvalues + gone[:, None], np.sqrt(variance) + gone[:, None], asymmetry + gone, asymmetry_stderr + gone
+    )
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Whether to trust the impedance of an arm, of M estimates: one verdict and its parts.
+
+    **Source:** Lakatos et al. 2011, III-C, eqs. (19), (20), (22); standard errors and the prediction of unseen torque
+    go beyond it.
+    """
+
+    condition: Numbers
+    """(M,) eq. (19)."""
+    stiffness: MatrixCriteria
+    damping: MatrixCriteria
+    relative_stderr: Numbers
+    """(M,) largest standard error of an element, as a share of its matrix's norm."""
+    held_out_vaf: Numbers
+    """(M,) share of the variance of unseen torque that is predicted."""
+    limits: TrustLimits
+
+    @property
+    def parts(self) -> dict[str, NDArray[np.bool_]]:
+        """(M,) which criterion is met."""
+        most = np.inf if self.limits.max_condition is None else self.limits.max_condition
+        return {
+            "condition": self.condition <= most,
+            "stiffness positive definite": self.stiffness.positive_definite(),
+            "damping positive definite": self.damping.positive_definite(),
+            "stiffness quasi-symmetric": self.stiffness.quasi_symmetric(self.limits),
+            "damping quasi-symmetric": self.damping.quasi_symmetric(self.limits),
+            "standard errors": self.relative_stderr <= self.limits.max_relative_stderr,
+            "held-out torque": self.held_out_vaf >= self.limits.min_vaf,
+        }
+
+    @property
+    def trusted(self) -> NDArray[np.bool_]:
+        """(M,) every criterion is met."""
+        return np.all(list(self.parts.values()), axis=0)
+
+    def in_words(self, k: int = 0) -> list[str]:
+        """The parts of one estimate, a line each."""
+        lines = [f"condition number {self.condition[k]:.3g}"]
+        for which, found in (("stiffness", self.stiffness), ("damping", self.damping)):
+            low, error = found.eigenvalues[k, 0], found.eigenvalue_stderr[k, 0]
+            lines.append(f"{which}: smallest eigenvalue {low:.3g} ± {error:.2g}")
+            share, error = found.asymmetry[k], found.asymmetry_stderr[k]
+            lines.append(f"{which}: antisymmetric part {share:.1%} ± {error:.1%} of the symmetric one")
+        lines.append(f"largest standard error {self.relative_stderr[k]:.1%} of the matrix")
+        lines.append(f"unseen torque predicted to {self.held_out_vaf[k]:.1%}")
+        failed = [name for name, kept in self.parts.items() if not kept[k]]
+        return [*lines, f"not met: {', '.join(failed)}" if failed else "trusted"]
+
+
+def confidence(
+    names: Sequence[str],
+    fit: Fit,
+    held_out_vaf: Num[AnyArray, "*M"],
+    limits: TrustLimits = TrustLimits(),
+) -> Confidence:
+    """Judge the estimates of an arm with damping and stiffness, of one window or of M.
+
+    **Arguments:** `names` (p) of the parameters; `held_out_vaf`, variance accounted for in trials or windows that the
+    estimates have not seen.
+
+    **Raises:** `ValueError` for a model without an arm's damping and stiffness.
+    """
+    p = len(names)
+    theta, stderr = (np.asarray(x).reshape(-1, p) for x in (fit.theta, fit.stderr))
+    covariance = np.asarray(fit.covariance).reshape(-1, p, p) if isinstance(fit, WindowFit) else None
+    K, D = (matrix_criteria(names, which, theta, stderr, covariance) for which in ("stiffness", "damping"))
+    if K is None or D is None:
+        raise ValueError(
+            f"these are the criteria of an arm's damping and stiffness, but the model has {', '.join(names)}"
+        )
+    shares = []
+    for which in ("stiffness", "damping"):
+        index = [k for k, name in enumerate(names) if name.startswith(f"{which}_")]
+        shares.append(stderr[:, index].max(axis=1) / np.linalg.norm(theta[:, index], axis=1))
+    return Confidence(
+        np.atleast_1d(fit.cond), K, D, np.max(shares, axis=0), np.atleast_1d(np.asarray(held_out_vaf)), limits
     )
 
 

@@ -39,7 +39,7 @@ GEAR_RATIO, G = 15.0, 9.81
 JOB = Job(
     recording={},
     robot_recording={},
-    model=ModelSettings(HumanSettings(gear_ratio=GEAR_RATIO), RobotSettings(GEAR_RATIO), (1,)),
+    model=ModelSettings(HumanSettings(gear_ratio=GEAR_RATIO), RobotSettings(GEAR_RATIO)),
     window=WindowSettings(WINDOW / RATE, step=1 / RATE),
     filter=FilterSettings(
         position_cutoff=10.0, decimation_cutoff=5.0, decimate=DECIMATE, mode="window", drop_transient=False

@@ -37,13 +37,15 @@ class PlanarArm(Model):
     - `gravity_1 = m_1 c_1 + m_2 l1` and `gravity_2 = m_2 c_2` [kg m], on `g cos q1` and `g cos(q1 + q2)`, for an arm
       in the vertical plane with `q1` from the horizontal (sines where it is from the vertical, `zero = "hanging"`): the
       second joint bears `gravity_2` alone;
+    - `rotor_inertia_2 * ddq_2` on the second joint alone: its motor's rotor, times its gear ratio squared [kg m^2]
+      (that of the first joint is a part of `inertia_1`);
     - `viscous_friction_i * dq_i`, `coulomb_friction_i * sign(dq_i)` and `offset_torque_i`, of joint i.
 
     **Arguments:** `equilibrium` (2,) the angles [rad] at which the elastic torque vanishes; `inertia`, `impedance`,
-    `gravity`, `viscous`, `coulomb`, `offset` choose the columns. With gravity, the `length` of the upper arm [m] says
-    that `inertia_2 = length * gravity_2` and leaves only the latter. The regressor takes absolute angles. Without
-    inertia it is the reduced one of eqs. (23) to (25), for the torque less `rigid_body_torque`; without impedance it is
-    a robot's or a limp arm's. `g` is the gravitational acceleration [m/s^2].
+    `gravity`, `rotor`, `viscous`, `coulomb`, `offset` choose the columns. With gravity, the `length` of the upper arm
+    [m] says that `inertia_2 = length * gravity_2` and leaves only the latter. The regressor takes absolute angles.
+    Without inertia it is the reduced one of eqs. (23) to (25), for the torque less `rigid_body_torque`; without
+    impedance it is a robot's or a limp arm's. `g` is the gravitational acceleration [m/s^2].
 
     **Raises:** ValueError for impedance without an equilibrium, or with viscous friction, whose columns it has already,
     and for a length without inertia or gravity.
@@ -67,6 +69,7 @@ class PlanarArm(Model):
         viscous: bool = False,
         coulomb: bool = False,
         offset: bool = False,
+        rotor: bool = False,
         g: float = 9.81,
         zero: str = "horizontal",
         length: float | None = None,
@@ -83,6 +86,7 @@ class PlanarArm(Model):
             _inertia_columns(inertia)
             | (_impedance_columns(self.equilibrium) if self.equilibrium else {})
             | _gravity_columns(gravity, g, zero)
+            | ({"rotor_inertia_2": "joint2.ddq"} if rotor else {})
             | _joint_columns("viscous_friction", viscous, "dq")
             | _joint_columns("coulomb_friction", coulomb, "sign(dq)")
             | _joint_columns("offset_torque", offset, "1")
@@ -92,7 +96,7 @@ class PlanarArm(Model):
         if not chosen:
             raise ValueError("the arm has no parameter left: switch at least one column on")
         self.names, self.columns = tuple(chosen), tuple(chosen.values())
-        unit = parameter_units("revolute") | {"gravity": "kg m"}
+        unit = parameter_units("revolute") | {"gravity": "kg m", "rotor_inertia": "kg m^2"}
         self.units = tuple(unit[name.rsplit("_", 1)[0]] for name in self.names)
         self.label = "arm"
         self.n_joints = 2
@@ -122,6 +126,7 @@ class PlanarArm(Model):
                 ddq[0] * cosine + dq[0] ** 2 * sine,
             ),
             "inertia_3": (ddq[1], ddq[0] + ddq[1]),
+            "rotor_inertia_2": (zero, ddq[1]),
             "gravity_1": (of_first, zero),
             "gravity_2": (of_both, of_both),
         }

@@ -83,7 +83,7 @@ class HeldTrials(eqx.Module):
 def hold(
     arm: HeldArm,
     amplitudes: Num[AnyArray, "T 2"],
-    duration: Num[AnyArray, ""],
+    duration: float | Num[AnyArray, ""],
     time: Num[AnyArray, " N"],
     key: PRNGKeyArray | None = None,
 ) -> HeldTrials:

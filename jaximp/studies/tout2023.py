@@ -121,7 +121,7 @@ def _job(offset: bool, length: float, methods: tuple[int, ...] = (1,), mode: str
     return Job(
         recording={},
         robot_recording={},
-        model=ModelSettings(HumanSettings(offset, GEAR_RATIO), RobotSettings(GEAR_RATIO), methods),
+        model=ModelSettings(HumanSettings(offset, GEAR_RATIO), RobotSettings(GEAR_RATIO), methods=methods),
         window=WindowSettings(length, step=0.02, min_velocity=0.1),
         filter=FilterSettings(
             position_cutoff=10.0, decimation_cutoff=5.0, mode=mode, drop_transient=False, decimate=40

@@ -1,0 +1,252 @@
+"""From the hand's position and force to an arm's impedance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaximp import load_recording, recording_from_arrays, save_recording
+from jaximp.job import FilterSettings
+from jaximp.least_squares import WindowFit
+from jaximp.models import PlanarArm
+from jaximp.regression import Filters, design_filters
+from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
+from jaximp.trials import Trials, fit_trials, joint_trials, read_trials, regress_trials
+from jaximp.trust import TrustLimits, confidence
+from jaximp.types import Recording
+
+RATE = 1000.0
+TIME = np.arange(-150, 420) / RATE
+QUIET = HeldArm(reflex_gain=0.0)
+ARM = PlanarArm((0.0, 0.0))
+TRUTH = np.concatenate([QUIET.inertia, np.ravel(QUIET.damping), np.ravel(QUIET.stiffness)])
+
+
+def filters(**settings: Any) -> Filters:
+    return design_filters(
+        FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0, **settings), RATE
+    )
+
+
+def recordings(trials: HeldTrials) -> list[Recording]:
+    """As a robot would log them: the command steps at the onset."""
+    commanded = np.where(TIME > 0, 1.0, 0.0)[:, None] * np.ones(2)
+    return [
+        recording_from_arrays(
+            time=TIME - TIME[0],
+            position=np.asarray(x),
+            torque=np.asarray(force),
+            reference=commanded,
+            joint="prismatic",
+            name=f"{k}",
+        )
+        for k, (x, force) in enumerate(zip(trials.position, trials.force, strict=True))
+    ]
+
+
+@pytest.fixture(scope="module")
+def held() -> HeldTrials:
+    return jax.jit(lambda: hold(QUIET, DIRECTIONS, 0.2, TIME, jax.random.key(0)))()
+
+
+@pytest.fixture(scope="module")
+def logged(held: HeldTrials) -> list[Recording]:
+    return recordings(held)
+
+
+@pytest.fixture(scope="module")
+def fitted(held: HeldTrials) -> WindowFit:
+    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
+    return fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+
+
+def test_the_robot_feels_what_the_arm_is() -> None:
+    """Noise-free: the torque is the regressor times the truth, and the hand's force does its work."""
+    clean = hold(QUIET, DIRECTIONS, 0.2, TIME)
+    model = PlanarArm(tuple(float(x) for x in QUIET.posture))
+    pressed = np.asarray(QUIET.geometry.joint_torque(QUIET.posture, QUIET.hand_force))
+    expected = model.torque(TRUTH, clean.angles, clean.velocities, clean.accelerations) + pressed
+    np.testing.assert_allclose(clean.torque, expected, atol=1e-12)
+    np.testing.assert_allclose(QUIET.geometry.joint_torque(clean.angles, clean.force), clean.torque, atol=1e-12)
+    np.testing.assert_allclose(QUIET.geometry.inverse(clean.position), clean.angles, atol=1e-12)
+    np.testing.assert_allclose(clean.angles[:, -1] - clean.angles[:, 0], DIRECTIONS, atol=1e-15)
+
+
+def test_reflexes_set_in_one_after_the_other() -> None:
+    arm = HeldArm(reflex_gain=0.6, rise=0.01)
+    t = np.array([0.0, *LATENCIES, 0.2]) - 1e-9
+    D, K = arm.impedance(t)
+    np.testing.assert_allclose(np.asarray(K)[:, 0, 0] / arm.stiffness[0, 0], [1, 1, 1.2, 1.4, 1.6], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(D) / np.asarray(K), np.broadcast_to(arm.damping / arm.stiffness, D.shape))
+
+
+def test_trials_give_back_inertia_damping_and_stiffness(fitted: WindowFit) -> None:
+    np.testing.assert_allclose(fitted.theta[:3], TRUTH[:3], rtol=0.01)
+    np.testing.assert_allclose(fitted.theta[3:], TRUTH[3:], rtol=0.02)
+
+
+def test_standard_errors_cover(held: HeldTrials) -> None:
+    """Over noise keys, the spread of the estimates is no larger than what is claimed."""
+
+    def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        noisy = hold(QUIET, DIRECTIONS, 0.2, TIME, key)
+        trials = joint_trials(QUIET.geometry, noisy.position, noisy.force, 150, RATE)
+        fit = fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+        return fit.theta, fit.stderr
+
+    theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), 40))
+    spread, claimed = np.std(theta, axis=0, ddof=1), np.median(stderr, axis=0)
+    assert (spread < 1.3 * claimed).all()
+    assert (spread > 0.2 * claimed).all()
+    np.testing.assert_allclose(np.mean(theta, axis=0), TRUTH, rtol=0.01)
+
+
+def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Recording], fitted: WindowFit) -> None:
+    read = []
+    for recording in logged:
+        path = tmp_path / f"trial_{recording.name}.csv"
+        save_recording(recording, path)
+        pairs = {channel: [f"{channel}_{j}_{unit}" for j in (1, 2)] for channel, unit in
+                 (("position", "m"), ("torque", "N"), ("reference", "m"))}  # fmt: skip
+        read.append(load_recording(path, time="time_s", joint="prismatic", **pairs))
+    trials = read_trials(read, QUIET.geometry, before=0.15, after=0.4)
+    assert trials.onset == 150
+    again = fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+    np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
+    given = read_trials(read, QUIET.geometry, onset=0.15, before=0.15, after=0.4)
+    np.testing.assert_array_equal(given.angles, trials.angles)
+
+
+def test_steady_state_is_taken_off(held: HeldTrials) -> None:
+    trials = joint_trials(QUIET.geometry, held.position, held.force + np.array([3.0, -2.0]), 150, RATE)
+    np.testing.assert_allclose(trials.torque[:, :150].mean(axis=1), 0, atol=1e-12)
+    np.testing.assert_allclose(trials.equilibrium, np.broadcast_to(QUIET.posture, (6, 2)), atol=1e-5)
+    assert len(trials) == 6
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        pytest.param(
+            lambda r: [r[0], replace(r[1], reference=None)], "trial 2 .1.: its onset is not known", id="onset"
+        ),
+        pytest.param(
+            lambda r: [replace(r[0], reference=np.zeros((len(r[0]), 2)))], "trial 1 .0.: no perturbation", id="command"
+        ),
+        pytest.param(lambda r: [r[0], shortened(r[1], 300)], "trial 2 .1. lasts from 0 to 0.299 s", id="too short"),
+        pytest.param(
+            lambda r: [replace(r[0], joints=("revolute", "revolute"))], "not a recording of a hand", id="hand"
+        ),
+        pytest.param(lambda r: [r[0], resampled(r[1])], "sampled at 500 Hz", id="rate"),
+        pytest.param(lambda r: [gap(r[0])], "gap around its onset", id="gap"),
+        pytest.param(lambda r: [], "no trials", id="none"),
+        pytest.param(lambda r: [moved(r[0], 1.0)], "reach", id="out of reach"),
+        pytest.param(lambda r: [moved(r[0], 0.0, straight=True)], "trial 1: the elbow", id="straight elbow"),
+    ],
+)
+def test_bad_trials_are_named(logged: list[Recording], spoil: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_trials(spoil(logged), QUIET.geometry)
+
+
+def shortened(recording: Recording, n: int) -> Recording:
+    names = ("time", "position", "torque", "valid", "reference")
+    return replace(recording, **{name: getattr(recording, name)[:n] for name in names})
+
+
+def resampled(recording: Recording) -> Recording:
+    names = ("time", "position", "torque", "valid", "reference")
+    return replace(recording, **{name: getattr(recording, name)[::2] for name in names})
+
+
+def gap(recording: Recording) -> Recording:
+    valid = recording.valid.copy()
+    valid[200] = False
+    return replace(recording, valid=valid)
+
+
+def moved(recording: Recording, by: float, straight: bool = False) -> Recording:
+    position = recording.position + by
+    if straight:
+        position = np.zeros_like(position) + np.array([sum(QUIET.lengths) - 1e-9, 0.0])
+    return replace(recording, position=position)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_too_little_data_is_refused(held: HeldTrials) -> None:
+    def rows(amplitudes: np.ndarray, samples: slice) -> Any:
+        trials = hold(QUIET, amplitudes, 0.2, TIME, jax.random.key(0))
+        trials = joint_trials(QUIET.geometry, trials.position[:, samples], trials.force[:, samples], 150, RATE)
+        return regress_trials(ARM, trials, filters())
+
+    line = rows(np.array([[0.05, -0.05], [-0.05, 0.05], [0.02, -0.02]]), slice(None))
+    with pytest.raises(ValueError, match="do not span the plane"):
+        fit_trials(line, 0.27)
+    both = rows(DIRECTIONS[:3], slice(None))
+    with pytest.raises(ValueError, match="directions of 1 trials"):
+        fit_trials(both, 0.27, counts=np.array([True, False, False]))
+    few = jax.tree.map(lambda x: x, both)
+    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks)
+    with pytest.raises(ValueError, match="cannot determine 11 parameters"):
+        fit_trials(few, 0.27)
+
+
+def test_confidence_is_one_verdict_with_its_parts(fitted: WindowFit) -> None:
+    found = confidence(ARM.names, fitted, 0.99)
+    assert found.trusted.all()
+    assert found.in_words()[-1] == "trusted"
+    eigenvalues = np.linalg.eigvalsh(
+        np.asarray(fitted.theta[7:]).reshape(2, 2) / 2 + np.asarray(fitted.theta[7:]).reshape(2, 2).T / 2
+    )
+    np.testing.assert_allclose(found.stiffness.eigenvalues[0], eigenvalues)
+    # Errors of first order, against draws from the covariance.
+    draws = np.random.default_rng(0).multivariate_normal(fitted.theta, fitted.covariance, 4000)
+    K = draws[:, 7:].reshape(-1, 2, 2)
+    spread = np.linalg.eigvalsh((K + K.swapaxes(1, 2)) / 2).std(axis=0)
+    np.testing.assert_allclose(found.stiffness.eigenvalue_stderr[0], spread, rtol=0.1)
+    difference = (K[:, 0, 1] - K[:, 1, 0]).std() / (np.sqrt(2) * np.linalg.norm((K[0] + K[0].T) / 2))
+    np.testing.assert_allclose(found.stiffness.asymmetry_stderr[0], difference, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "limits", "held_out", "part"),
+    [
+        pytest.param({10: -1.0}, TrustLimits(), 0.99, "stiffness positive definite", id="indefinite"),
+        pytest.param({3: -1.0}, TrustLimits(), 0.99, "damping positive definite", id="negative damping"),
+        pytest.param({8: 30.0}, TrustLimits(), 0.99, "stiffness quasi-symmetric", id="asymmetric"),
+        pytest.param({}, TrustLimits(max_condition=10.0), 0.99, "condition", id="condition"),
+        pytest.param({}, TrustLimits(max_relative_stderr=1e-6), 0.99, "standard errors", id="errors"),
+        pytest.param({}, TrustLimits(), 0.5, "held-out torque", id="held out"),
+    ],
+)
+def test_every_criterion_can_fail(
+    fitted: WindowFit, change: dict[int, float], limits: TrustLimits, held_out: float, part: str
+) -> None:
+    theta = np.array(fitted.theta)
+    for k, value in change.items():
+        theta[k] = value
+    spoilt = jax.tree.map(lambda x: x, fitted)
+    object.__setattr__(spoilt, "theta", jnp.asarray(theta))
+    found = confidence(ARM.names, spoilt, held_out, limits)
+    assert not found.trusted[0]
+    assert not found.parts[part][0]
+    assert part in found.in_words()[-1]
+
+
+def test_confidence_needs_an_arm(fitted: WindowFit) -> None:
+    with pytest.raises(ValueError, match="damping and stiffness"):
+        confidence([f"x{k}" for k in range(11)], fitted, 1.0)
+
+
+def test_trials_are_a_pytree(held: HeldTrials) -> None:
+    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
+    traced = jax.jit(lambda x, f: joint_trials(QUIET.geometry, x, f, 150, RATE))(held.position, held.force)
+    assert isinstance(traced, Trials)
+    np.testing.assert_allclose(traced.torque, trials.torque, atol=1e-12)
