@@ -193,7 +193,7 @@ class Confidence:
 def confidence(
     names: Sequence[str],
     fit: Fit,
-    held_out_vaf: Num[AnyArray, "*M"],
+    held_out_vaf: float | Num[AnyArray, "*M"],
     limits: TrustLimits = TrustLimits(),
 ) -> Confidence:
     """Judge the estimates of an arm with damping and stiffness, of one window or of M.

@@ -79,6 +79,24 @@ def test_torque_is_lagranges(g: float) -> None:
     np.testing.assert_allclose(arm.torque(theta, q, dq, ddq), expected, rtol=1e-12, atol=1e-11)
 
 
+def test_a_hanging_arm_is_a_horizontal_one_turned_by_a_quarter() -> None:
+    q, dq, ddq = motion()
+    hanging, horizontal = (PlanarArm(impedance=False, gravity=True, zero=zero) for zero in ("hanging", "horizontal"))
+    turned = q - np.array([np.pi / 2, 0])
+    np.testing.assert_allclose(hanging.regressor(q, dq, ddq), horizontal.regressor(turned, dq, ddq), atol=1e-11)
+
+
+def test_a_known_length_ties_inertia_to_gravity() -> None:
+    q, dq, ddq = motion()
+    length = BORNER.lengths[0]
+    tied = PlanarArm(impedance=False, gravity=True, length=length, rotor=True)
+    assert tied.names == ("inertia_1", "inertia_3", "gravity_1", "gravity_2", "rotor_inertia_2")
+    xi, gravity = np.asarray(BORNER.base_parameters()), np.asarray(BORNER.gravity_parameters())
+    expected = np.asarray(rigid_body_torque(q, dq, ddq, xi, gravity)) + np.stack([0 * ddq[:, 1], 0.02 * ddq[:, 1]], 1)
+    found = tied.torque(np.concatenate([xi[[0, 2]], gravity, [0.02]]), q, dq, ddq)
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+
+
 def test_torque_is_the_mass_the_coriolis_and_the_gravity_terms() -> None:
     q, dq, ddq = motion()
     xi, gravity = BORNER.base_parameters(), BORNER.gravity_parameters()
@@ -326,6 +344,8 @@ def test_a_gap_in_the_positions_is_a_gap_in_the_angles() -> None:
         pytest.param(lambda: PlanarArm(REST, impedance=False), "only the stiffness", id="equilibrium of no impedance"),
         pytest.param(lambda: PlanarArm(REST, viscous=True), "viscous friction already", id="damping twice"),
         pytest.param(lambda: PlanarArm(impedance=False, inertia=False), "switch at least one", id="no column left"),
+        pytest.param(lambda: PlanarArm(REST, zero="up"), "zero is 'up'", id="unknown zero"),
+        pytest.param(lambda: PlanarArm(REST, length=0.3), "needs inertia and gravity", id="length without gravity"),
         pytest.param(lambda: PlanarArm(REST) + PlanarArm(REST), "both models are called 'arm'", id="arm + arm"),
         pytest.param(lambda: PlanarArm(REST) + RobotJoint(), "2 and 1 joints", id="arm + one joint"),
         pytest.param(lambda: PlanarArm(REST).regressor(*[np.ones((4, 3))] * 3), "has 2 joints", id="three joints"),

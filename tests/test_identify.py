@@ -8,6 +8,8 @@ import pytest
 
 from jaximp.identify import identify, identify_recording, in_windows, prepare
 from jaximp.job import parse_job
+from jaximp.least_squares import confidence_interval
+from jaximp.models import PlanarArm
 from jaximp.recordings import recording_from_arrays
 from jaximp.types import Recording
 
@@ -221,3 +223,107 @@ def test_the_ankle_with_a_reflex_is_called_a_poor_fit(data_folder: Path) -> None
     counts = identify(parse_job(text, data_folder))[0].verdicts.counts()
     assert counts["trusted"] == 0
     assert counts["poor fit"] > 0.9 * sum(counts.values())
+
+
+PENDULUM = """
+[recording]
+file = "double_pendulum/20220812-060440-PM_measured.csv"
+time = "time"
+position = ["pos1", "pos2"]
+torque = ["tau1", "tau2"]
+[model.arm]
+gravity = true
+zero = "hanging"
+length = 0.3
+rotor = true
+viscous = true
+coulomb = true
+[filter]
+position_cutoff = 20
+position_order = 4
+decimation_cutoff = 10
+[window]
+length = 5
+step = 0.5
+min_velocity = 0.1
+"""
+
+
+def test_the_double_pendulum_is_near_its_owners_own_fit(data_folder: Path) -> None:
+    """Windows of one file; all four together stand in experiments/real_recordings.py."""
+    estimates = identify(parse_job(PENDULUM, data_folder))[0]
+    found = dict(zip(estimates.names, estimates.mean_over_trusted(), strict=True))
+    assert estimates.verdicts.trusted.mean() > 0.7
+    assert found["inertia_1"] - found["inertia_3"] == pytest.approx(0.1106, rel=0.15)
+    assert found["gravity_2"] == pytest.approx(0.1111, rel=0.15)
+    assert found["inertia_3"] == pytest.approx(0.0239, rel=0.15)
+    assert found["gravity_1"] == pytest.approx(0.3491, rel=0.15)
+    assert estimates.torque.shape[1] == 2
+
+
+def arm_recording(stiffness: np.ndarray, noise: float = 0.01) -> Recording:
+    """An arm that a robot moves for 12 s, each joint with frequencies of its own."""
+    t = np.arange(0, 12, 0.002)
+    q = np.stack([0.1 * np.sin(9 * t) + 0.05 * np.sin(21 * t), 1 + 0.1 * np.sin(13 * t) + 0.05 * np.sin(29 * t)], 1)
+    dq = np.stack([0.9 * np.cos(9 * t) + 1.05 * np.cos(21 * t), 1.3 * np.cos(13 * t) + 1.45 * np.cos(29 * t)], 1)
+    ddq = -np.stack([8.1 * np.sin(9 * t) + 22.05 * np.sin(21 * t), 16.9 * np.sin(13 * t) + 42.05 * np.sin(29 * t)], 1)
+    theta = np.concatenate([[0.27, 0.08, 0.07, 2.4, 1.2, 1.2, 1.4], np.ravel(stiffness)])
+    torque = np.asarray(PlanarArm((0.0, 1.0)).torque(theta, q, dq, ddq))
+    torque = torque + noise * np.random.default_rng(0).normal(size=torque.shape)
+    return recording_from_arrays(time=t, position=q, torque=torque)
+
+
+ARM = """
+recording = {}
+[model]
+arm = { equilibrium = [0, 1] }
+[filter]
+decimation_cutoff = 20
+[window]
+length = 3
+step = 0.5
+"""
+
+
+def test_an_arm_is_identified_in_windows() -> None:
+    stiffness = np.array([[29.0, 14.4], [14.4, 17.1]])
+    estimates = identify_recording(parse_job(ARM), arm_recording(stiffness))[0]
+    assert estimates.verdicts.trusted.all()
+    np.testing.assert_allclose(estimates.mean_over_trusted()[-4:], np.ravel(stiffness), rtol=0.02)
+    low, high = confidence_interval(estimates.fit.theta, estimates.fit.stderr, estimates.fit.dof)
+    covered = (low[:, -4:] < np.ravel(stiffness)) & (np.ravel(stiffness) < high[:, -4:])
+    assert covered.mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "why"),
+    [
+        pytest.param(np.array([[29.0, 40.0], [40.0, 17.1]]), "not positive definite", id="indefinite"),
+        pytest.param(np.array([[29.0, 20.0], [2.0, 17.1]]), "not symmetric", id="asymmetric"),
+    ],
+)
+def test_an_impossible_stiffness_is_not_trusted(stiffness: np.ndarray, why: str) -> None:
+    verdicts = identify_recording(parse_job(ARM), arm_recording(stiffness))[0].verdicts
+    assert (verdicts.verdict == "poor fit").all()
+    assert all(why in reason for reason in verdicts.reason)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (ARM.replace("arm = { equilibrium = [0, 1] }", "arm = { equilibrium = [0] }"), "equilibrium"),
+        (ARM.replace("arm =", "human = true\narm ="), "stands alone"),
+        (ARM.replace("[0, 1]", '"zero"'), "a list of numbers"),
+    ],
+    ids=["one angle", "arm and human", "words"],
+)
+def test_bad_arms_are_refused(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        parse_job(text)
+
+
+def test_an_arm_needs_two_joints() -> None:
+    one = arm_recording(np.eye(2))
+    one = replace(one, position=one.position[:, :1], torque=one.torque[:, :1], joints=("revolute",))
+    with pytest.raises(ValueError, match="two revolute joints"):
+        identify_recording(parse_job(ARM), one)

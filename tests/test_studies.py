@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaximp.studies import tout2023
+from jaximp.studies import lakatos2011, tout2023
 
 
 def test_tout2023_is_reproduced(tmp_path: Path) -> None:
@@ -51,3 +51,34 @@ def test_convergence_time(values: list[float], settled: float, expected: float |
     track = tout2023.Track("x", np.arange(7.0) + 1.5, np.array(values, float))
     found = tout2023.convergence_time(track, 4.5, settled)
     assert found == expected
+
+
+def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of what is swept: the same code, fewer cases."""
+    for name, values in {
+        "FORCE_NOISE": lakatos2011.FORCE_NOISE[:2],
+        "POSITION_NOISE": lakatos2011.POSITION_NOISE[:2],
+        "REFLEX_GAINS": lakatos2011.REFLEX_GAINS[:3],
+        "SEEDS": 1,
+        "DURATIONS": np.array([0.1, 0.2, 0.3, 0.4]),
+        "SHORTER": np.array([0.27, 0.37]),
+        "WAY_POINTS": 3,
+    }.items():
+        monkeypatch.setattr(lakatos2011, name, values)
+    lakatos2011.reproduce(tmp_path)
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"figure_4", "figure_5", "figure_6", "bias", "shorter"}
+    tables = json.loads((tmp_path / "tables.json").read_text())
+    for row, closed in (("fifth order", (1 / 12, 1 / 504, 1 / 42)), ("sixth order", (3 / 44, 1 / 792, 1 / 54))):
+        assert list(tables["table_1"][row]["numbers"].values()) == pytest.approx(closed, rel=1e-9)
+    gains = tables["by_reflex_gain_ms"]["full"]
+    assert gains["stiffness near the truth"]["0"]["longest"] == 170  # without reflexes even the shortest will do
+    assert gains["stiffness near the truth"]["0.5"]["longest"] > 170
+    shorter = tables["shorter"]
+    assert shorter["designed"][1] < 0.95 * shorter["condition_of_the_paper_at_370_ms"]
+    assert "| stiffness positive definite | 320 |" in (tmp_path / "tables.md").read_text()
+
+
+def test_thresholds_hold_for_all_longer_observations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lakatos2011, "DURATIONS", np.array([0.1, 0.2, 0.3]))
+    kept = np.array([[True, False, True], [False, True, True], [True, True, False], [True, True, True]])
+    np.testing.assert_allclose(lakatos2011.thresholds(kept), [0.37, 0.27, np.inf, 0.17])

@@ -91,11 +91,14 @@ def test_trials_give_back_inertia_damping_and_stiffness(fitted: WindowFit) -> No
     np.testing.assert_allclose(fitted.theta[3:], TRUTH[3:], rtol=0.02)
 
 
-def test_standard_errors_cover(held: HeldTrials) -> None:
-    """Over noise keys, the spread of the estimates is no larger than what is claimed."""
+@pytest.mark.parametrize(("position_noise", "least"), [(0.0, 0.6), (1e-5, 0.1)], ids=["force", "and position"])
+def test_standard_errors_are_not_too_small(position_noise: float, least: float) -> None:
+    """Over noise keys. Noise of the position is differentiated twice and looks like much noise of the torque, of which
+    little is where the estimates are: the errors are then on the safe side."""
+    arm = HeldArm(reflex_gain=0.0, position_noise=position_noise)
 
     def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        noisy = hold(QUIET, DIRECTIONS, 0.2, TIME, key)
+        noisy = hold(arm, DIRECTIONS, 0.2, TIME, key)
         trials = joint_trials(QUIET.geometry, noisy.position, noisy.force, 150, RATE)
         fit = fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
         return fit.theta, fit.stderr
@@ -103,7 +106,7 @@ def test_standard_errors_cover(held: HeldTrials) -> None:
     theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), 40))
     spread, claimed = np.std(theta, axis=0, ddof=1), np.median(stderr, axis=0)
     assert (spread < 1.3 * claimed).all()
-    assert (spread > 0.2 * claimed).all()
+    assert (spread > least * claimed).all()
     np.testing.assert_allclose(np.mean(theta, axis=0), TRUTH, rtol=0.01)
 
 
@@ -112,7 +115,7 @@ def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Record
     for recording in logged:
         path = tmp_path / f"trial_{recording.name}.csv"
         save_recording(recording, path)
-        pairs = {channel: [f"{channel}_{j}_{unit}" for j in (1, 2)] for channel, unit in
+        pairs = {channel: [f"{channel}{j}_{unit}" for j in (1, 2)] for channel, unit in
                  (("position", "m"), ("torque", "N"), ("reference", "m"))}  # fmt: skip
         read.append(load_recording(path, time="time_s", joint="prismatic", **pairs))
     trials = read_trials(read, QUIET.geometry, before=0.15, after=0.4)
@@ -153,7 +156,7 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
 )
 def test_bad_trials_are_named(logged: list[Recording], spoil: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        read_trials(spoil(logged), QUIET.geometry)
+        read_trials(spoil(logged), QUIET.geometry, after=0.4)
 
 
 def shortened(recording: Recording, n: int) -> Recording:
@@ -193,9 +196,19 @@ def test_too_little_data_is_refused(held: HeldTrials) -> None:
     with pytest.raises(ValueError, match="directions of 1 trials"):
         fit_trials(both, 0.27, counts=np.array([True, False, False]))
     few = jax.tree.map(lambda x: x, both)
-    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks)
+    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks, few.jacobian)
     with pytest.raises(ValueError, match="cannot determine 11 parameters"):
         fit_trials(few, 0.27)
+
+
+def test_equations_at_the_hand_are_those_of_the_joints(held: HeldTrials) -> None:
+    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
+    rows = regress_trials(ARM, trials, filters())
+    there = rows.at_hand()
+    J = np.asarray(QUIET.geometry.jacobian(trials.equilibrium))
+    for k in (0, 3):
+        np.testing.assert_allclose(there.torque[k] @ J[k], rows.torque[k], atol=1e-10)
+        np.testing.assert_allclose(np.einsum("nap,aj->njp", there.W[k], J[k]), rows.W[k], atol=1e-10)
 
 
 def test_confidence_is_one_verdict_with_its_parts(fitted: WindowFit) -> None:

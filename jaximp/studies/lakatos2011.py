@@ -113,7 +113,7 @@ def times() -> Numbers:
 
 
 @eqx.filter_jit
-def sweep(arms: HeldArm, keys: PRNGKeyArray, durations: Array, inertia: Array) -> Outcome:
+def sweep(arms: HeldArm, keys: Array, durations: Array, inertia: Array) -> Outcome:
     """Every arm with its key, and every duration: one call."""
 
     def one(arm: HeldArm, key: PRNGKeyArray, duration: Array) -> Outcome:
@@ -140,7 +140,7 @@ def sweep(arms: HeldArm, keys: PRNGKeyArray, durations: Array, inertia: Array) -
 def _estimate(rows: TrialRows, observed: Array, known: int) -> Estimate:
     noise = filters().noise
     assert noise is not None
-    fit = fit_trials(rows, observed, jnp.arange(len(rows.torque)) != HELD_OUT, noise)
+    fit = fit_trials(rows, observed, jnp.arange(len(rows.torque)) != HELD_OUT, noise, at_hand=False)  # as the paper
     W, torque = rows.W[HELD_OUT], rows.torque[HELD_OUT]
     inside = ((rows.time >= 0) & (rows.time <= observed)).astype(float)
     predicted = W @ fit.theta
@@ -148,7 +148,7 @@ def _estimate(rows: TrialRows, observed: Array, known: int) -> Estimate:
     return Estimate(fit, vaf, predicted)
 
 
-def cases() -> tuple[HeldArm, PRNGKeyArray]:
+def cases() -> tuple[HeldArm, Array]:
     """Every noise with every strength of the reflexes and every seed, as one batch."""
     index = np.indices((len(FORCE_NOISE), len(REFLEX_GAINS), SEEDS)).reshape(3, -1)
     arms = eqx.filter_vmap(
