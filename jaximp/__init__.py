@@ -3,11 +3,14 @@
 from jaximp import models
 from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.identify import Estimates, identify, identify_recording
-from jaximp.job import Job, parse_job, read_job
+from jaximp.job import FilterSettings, Job, parse_job, read_job
 from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
+from jaximp.perturbations import Perturbations, design_perturbations
 from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.recursive import RecursiveFit, recursive_least_squares
 from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
+from jaximp.trials import fit_trials, joint_trials, read_trials, regress_trials
+from jaximp.trust import TrustLimits, confidence
 from jaximp.types import Recording
 from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
@@ -15,30 +18,39 @@ __all__ = [
     "Design",
     "Encoder",
     "Estimates",
+    "FilterSettings",
     "FourierSeries",
     "Job",
     "Limits",
     "MinimumJerk",
+    "Perturbations",
     "RaisedSine",
     "Recording",
     "RecursiveFit",
     "SixthOrder",
     "SlidingFit",
+    "TrustLimits",
     "WindowFit",
     "adaptive_least_squares",
     "at_rest",
+    "confidence",
     "confidence_interval",
     "design_excitation",
+    "design_perturbations",
+    "fit_trials",
     "identify",
     "identify_recording",
     "jerk",
+    "joint_trials",
     "least_squares",
     "load_recording",
     "models",
     "parse_job",
     "read_job",
+    "read_trials",
     "recording_from_arrays",
     "recursive_least_squares",
+    "regress_trials",
     "save_recording",
     "sliding_least_squares",
     "sliding_pieces",

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
+from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import ArmGeometry, PlanarArm
-from jaximp.regression import Filters, filtered
+from jaximp.regression import design_filters, filtered
 from jaximp.types import AnyArray, Numbers, Recording
 
 STEADY = 0.02
@@ -61,6 +62,8 @@ class TrialRows(eqx.Module):
     """Displacement of the joints [rad] where each trial is farthest from its equilibrium."""
     jacobian: Float[Array, "T 2 2"]
     """See `Trials`."""
+    noise: Float[Array, " L"] | None
+    """What the filters make of white noise of the torque: its autocovariance by lag, in rows."""
 
     def at_hand(self) -> TrialRows:
         """The same equations as forces on the hand: there the noise of both axes is alike, which that of the joints'
@@ -69,7 +72,7 @@ class TrialRows(eqx.Module):
         inverse = jnp.stack([jnp.stack([d, -c], axis=-1), jnp.stack([-b, a], axis=-1)], axis=-2)
         inverse = (inverse / (a * d - b * c)[:, None, None])[:, None]
         W, torque = (inverse[..., None] * self.W[:, :, None]).sum(axis=3), (inverse * self.torque[:, :, None]).sum(-1)
-        return TrialRows(W, torque, self.time, self.peaks, self.jacobian)
+        return TrialRows(W, torque, self.time, self.peaks, self.jacobian, self.noise)
 
 
 def joint_trials(
@@ -163,11 +166,13 @@ def _check_hand(name: str, recording: Recording, rate: float) -> None:
         )
 
 
-def regress_trials(model: PlanarArm, trials: Trials, filters: Filters) -> TrialRows:
-    """Filter every trial and evaluate the model on it, with the trial's own equilibrium.
+def regress_trials(model: PlanarArm, trials: Trials, settings: FilterSettings) -> TrialRows:
+    """Filter every trial and evaluate the model on it, with the trial's own equilibrium in place of the model's.
 
     **Source:** Lakatos et al. 2011, eqs. (12), (13).
     """
+
+    filters = design_filters(settings, trials.sample_rate)
 
     def one(q: Array, torque: Array, equilibrium: Array) -> tuple[Array, Array]:
         return filtered(model.at(equilibrium), filters, trials.sample_rate, q, torque)[:2]
@@ -177,21 +182,21 @@ def regress_trials(model: PlanarArm, trials: Trials, filters: Filters) -> TrialR
     time = (jnp.arange(n)[:: filters.decimate] - trials.onset) / trials.sample_rate
     away = trials.angles - trials.equilibrium[:, None]
     farthest = jnp.argmax((away**2).sum(axis=-1), axis=1)
-    return TrialRows(W, torque, time, away[jnp.arange(len(away)), farthest], trials.jacobian)
+    noise = None if filters.noise is None else jnp.asarray(filters.noise)
+    return TrialRows(W, torque, time, away[jnp.arange(len(away)), farthest], trials.jacobian, noise)
 
 
 def fit_trials(
     rows: TrialRows,
     observed: float | Num[AnyArray, ""],
     counts: Bool[AnyArray, " T"] | None = None,
-    noise: Num[AnyArray, " L"] | None = None,
     at_hand: bool = True,
 ) -> WindowFit:
     """One set of parameters from the first `observed` seconds after the onset of all trials, eq. (14).
 
-    **Arguments:** `counts` (T,) False for trials that are held out; `noise` the autocovariance of a row's noise, as in
-    `least_squares`. The noise is that of the force: `at_hand` weighs the equations accordingly. Without it the joints'
-    torques count alike, as in the paper, and the standard errors are up to 1.4 times too small or too large.
+    **Arguments:** `counts` (T,) False for trials that are held out. The noise is that of the force: `at_hand` weighs
+    the equations accordingly. Without it the joints' torques count alike, as in the paper, and standard errors are up
+    to 1.4 times too small or too large.
 
     **Raises:** `ValueError` for fewer rows than parameters, and for directions that do not span the plane.
     """
@@ -207,7 +212,7 @@ def fit_trials(
     valid = jnp.broadcast_to(inside, (T, N)) & (True if counts is None else jnp.asarray(counts)[:, None])
     shape = (T * N, n)
     valid = jnp.broadcast_to(valid.reshape(-1, 1), shape)
-    return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, noise)
+    return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, rows.noise)
 
 
 def _check_directions(peaks: Numbers) -> None:

@@ -60,6 +60,7 @@ def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         "POSITION_NOISE": lakatos2011.POSITION_NOISE[:2],
         "REFLEX_GAINS": lakatos2011.REFLEX_GAINS[:3],
         "SEEDS": 1,
+        "CUFFS": (None, 5e3),
         "DURATIONS": np.array([0.1, 0.2, 0.3, 0.4]),
         "SHORTER": np.array([0.27, 0.37]),
         "WAY_POINTS": 3,
@@ -70,9 +71,9 @@ def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     tables = json.loads((tmp_path / "tables.json").read_text())
     for row, closed in (("fifth order", (1 / 12, 1 / 504, 1 / 42)), ("sixth order", (3 / 44, 1 / 792, 1 / 54))):
         assert list(tables["table_1"][row]["numbers"].values()) == pytest.approx(closed, rel=1e-9)
-    gains = tables["by_reflex_gain_ms"]["full"]
-    assert gains["stiffness near the truth"]["0"]["longest"] == 170  # without reflexes even the shortest will do
-    assert gains["stiffness near the truth"]["0.5"]["longest"] > 170
+    cuffs = tables["by_cuff_ms"]["full"]["stiffness near the truth"]
+    assert cuffs["hand follows exactly"]["shortest"] == 170  # without reflexes even the shortest observation will do
+    assert cuffs["cuff of 5 kN/m"]["shortest"] is None or cuffs["cuff of 5 kN/m"]["shortest"] > 170
     shorter = tables["shorter"]
     assert shorter["designed"][1] < 0.95 * shorter["condition_of_the_paper_at_370_ms"]
     assert "| stiffness positive definite | 320 |" in (tmp_path / "tables.md").read_text()

@@ -15,7 +15,6 @@ from jaximp import load_recording, recording_from_arrays, save_recording
 from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit
 from jaximp.models import PlanarArm
-from jaximp.regression import Filters, design_filters
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
 from jaximp.trials import Trials, fit_trials, joint_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
@@ -28,10 +27,7 @@ ARM = PlanarArm((0.0, 0.0))
 TRUTH = np.concatenate([QUIET.inertia, np.ravel(QUIET.damping), np.ravel(QUIET.stiffness)])
 
 
-def filters(**settings: Any) -> Filters:
-    return design_filters(
-        FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0, **settings), RATE
-    )
+FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0)
 
 
 def recordings(trials: HeldTrials) -> list[Recording]:
@@ -63,7 +59,7 @@ def logged(held: HeldTrials) -> list[Recording]:
 @pytest.fixture(scope="module")
 def fitted(held: HeldTrials) -> WindowFit:
     trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
-    return fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+    return fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
 
 
 def test_the_robot_feels_what_the_arm_is() -> None:
@@ -76,6 +72,27 @@ def test_the_robot_feels_what_the_arm_is() -> None:
     np.testing.assert_allclose(QUIET.geometry.joint_torque(clean.angles, clean.force), clean.torque, atol=1e-12)
     np.testing.assert_allclose(QUIET.geometry.inverse(clean.position), clean.angles, atol=1e-12)
     np.testing.assert_allclose(clean.angles[:, -1] - clean.angles[:, 0], DIRECTIONS, atol=1e-15)
+
+
+def test_a_cuff_that_hardly_yields_is_none_and_a_soft_one_hides_the_hand() -> None:
+    def through(stiffness: float) -> HeldTrials:
+        arm = HeldArm(reflex_gain=0.0, yields=True, cuff_stiffness=stiffness)
+        return jax.jit(lambda: hold(arm, DIRECTIONS[:2], 0.15, TIME))()
+
+    exact, hard, soft = hold(QUIET, DIRECTIONS[:2], 0.15, TIME), through(2e6), through(5e3)
+    np.testing.assert_allclose(hard.angles, exact.angles, atol=1e-4)
+    np.testing.assert_allclose(hard.torque, exact.torque, atol=0.05 * np.abs(exact.torque).max())
+    np.testing.assert_allclose(soft.position, exact.position, atol=1e-15)  # the robot knows its own
+    assert np.abs(soft.angles - exact.angles).max() > 5e-3
+    # The motion is that of an arm under the measured force.
+    model = PlanarArm(tuple(float(x) for x in QUIET.posture))
+    pressed = np.asarray(QUIET.geometry.joint_torque(QUIET.posture, QUIET.hand_force))
+    expected = model.torque(TRUTH, soft.angles, soft.velocities, soft.accelerations) + pressed
+    np.testing.assert_allclose(soft.torque, expected, atol=1e-9)
+    np.testing.assert_allclose(np.gradient(soft.angles, 1 / RATE, axis=1)[:, 1:-1], soft.velocities[:, 1:-1], atol=2e-3)
+    np.testing.assert_allclose(
+        np.gradient(soft.velocities, 1 / RATE, axis=1)[:, 200:-1], soft.accelerations[:, 200:-1], atol=0.2
+    )
 
 
 def test_reflexes_set_in_one_after_the_other() -> None:
@@ -100,7 +117,7 @@ def test_standard_errors_are_not_too_small(position_noise: float, least: float) 
     def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         noisy = hold(arm, DIRECTIONS, 0.2, TIME, key)
         trials = joint_trials(QUIET.geometry, noisy.position, noisy.force, 150, RATE)
-        fit = fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+        fit = fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
         return fit.theta, fit.stderr
 
     theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), 40))
@@ -120,7 +137,7 @@ def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Record
         read.append(load_recording(path, time="time_s", joint="prismatic", **pairs))
     trials = read_trials(read, QUIET.geometry, before=0.15, after=0.4)
     assert trials.onset == 150
-    again = fit_trials(regress_trials(ARM, trials, filters()), 0.27, noise=filters().noise)
+    again = fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
     np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
     given = read_trials(read, QUIET.geometry, onset=0.15, before=0.15, after=0.4)
     np.testing.assert_array_equal(given.angles, trials.angles)
@@ -187,7 +204,7 @@ def test_too_little_data_is_refused(held: HeldTrials) -> None:
     def rows(amplitudes: np.ndarray, samples: slice) -> Any:
         trials = hold(QUIET, amplitudes, 0.2, TIME, jax.random.key(0))
         trials = joint_trials(QUIET.geometry, trials.position[:, samples], trials.force[:, samples], 150, RATE)
-        return regress_trials(ARM, trials, filters())
+        return regress_trials(ARM, trials, FILTER)
 
     line = rows(np.array([[0.05, -0.05], [-0.05, 0.05], [0.02, -0.02]]), slice(None))
     with pytest.raises(ValueError, match="do not span the plane"):
@@ -196,14 +213,14 @@ def test_too_little_data_is_refused(held: HeldTrials) -> None:
     with pytest.raises(ValueError, match="directions of 1 trials"):
         fit_trials(both, 0.27, counts=np.array([True, False, False]))
     few = jax.tree.map(lambda x: x, both)
-    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks, few.jacobian)
+    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks, few.jacobian, few.noise)
     with pytest.raises(ValueError, match="cannot determine 11 parameters"):
         fit_trials(few, 0.27)
 
 
 def test_equations_at_the_hand_are_those_of_the_joints(held: HeldTrials) -> None:
     trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
-    rows = regress_trials(ARM, trials, filters())
+    rows = regress_trials(ARM, trials, FILTER)
     there = rows.at_hand()
     J = np.asarray(QUIET.geometry.jacobian(trials.equilibrium))
     for k in (0, 3):

@@ -53,6 +53,10 @@ class ArmGeometry(eqx.Module):
         of_y = jnp.stack([l1 * cosine1 + l2 * cosine, l2 * cosine], axis=-1)
         return jnp.stack([of_x, of_y], axis=-2)
 
+    def velocity(self, q: Num[ArrayLike, "... 2"], dq: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
+        """Velocity of the hand [m/s] at the angles `q` [rad] and velocities `dq` [rad/s] of the joints."""
+        return (self.jacobian(q) * jnp.asarray(dq)[..., None, :]).sum(axis=-1)
+
     def joint_torque(self, q: Num[ArrayLike, "... 2"], force: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Torques of the joints [N m] that a force on the hand [N] makes, `J' force`: Börner et al. 2020, eq. (23)."""
         return (self.jacobian(q) * jnp.asarray(force)[..., :, None]).sum(axis=-2)

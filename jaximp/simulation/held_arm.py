@@ -1,8 +1,9 @@
 """An arm in the hand of a position-controlled robot that perturbs it: Lakatos et al. 2011, IV-A and IV-B.
 
 The robot imposes the motion, so that it is known exactly and only the force on the hand answers: rigid body, and the
-damping and stiffness of the muscles, which rise when reflexes set in. Where the paper gives no number (impedance,
-noise, strength of the reflexes) the defaults are a **choice**, meant to be swept.
+damping and stiffness of the muscles, which rise when reflexes set in. Or a cuff that yields stands between robot and
+hand: then the robot knows its own position, not that of the hand. Where the paper gives no number (impedance, noise,
+strength of the reflexes, cuff) the defaults are a **choice**, meant to be swept.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 
-from jaximp.models import ArmGeometry, rigid_body_torque
+from jaximp.models import ArmGeometry, mass_matrix, rigid_body_torque
 from jaximp.trajectories import MinimumJerk, array_field
 from jaximp.types import AnyArray
 
@@ -44,6 +45,12 @@ class HeldArm(eqx.Module):
     """By which share stiffness and damping have risen when all reflexes are there; each brings a third. A choice."""
     rise: Float[Any, ""] = array_field(default=0.02)
     """Time in which each reflex comes in [s]. A choice."""
+    yields: bool = eqx.field(static=True, default=False)
+    """Whether there is a cuff that yields between robot and hand, and flesh under it."""
+    cuff_stiffness: Float[Any, ""] = array_field(default=10e3)
+    """Of both axes [N/m], if it does. A choice."""
+    cuff_damping: Float[Any, ""] = array_field(default=40.0)
+    """[N s/m]. A choice."""
     force_noise: Float[Any, ""] = array_field(default=0.05)
     """Standard deviation of the white noise of each force [N]. A choice."""
     position_noise: Float[Any, ""] = array_field(default=1e-5)
@@ -97,19 +104,84 @@ def hold(
     **Source:** Lakatos et al. 2011, eqs. (9), (16), IV-B.
     """
     t = jnp.asarray(time)
-    profile = MinimumJerk(jnp.array([0.0, 1.0]), jnp.asarray(duration, float))(t)
-    away, dq, ddq = (jnp.multiply.outer(x, jnp.asarray(amplitudes)).swapaxes(0, 1) for x in profile)
-    q = arm.posture + away
-    D, K = arm.impedance(t)
-    pressed = arm.geometry.joint_torque(arm.posture, arm.hand_force)
-    muscles = (D * dq[..., None, :] + K * away[..., None, :]).sum(axis=-1)
-    torque = rigid_body_torque(q, dq, ddq, jnp.asarray(arm.inertia)) + muscles + pressed
-    position, force = arm.geometry.forward(q), _hand_force(arm.geometry, q, torque)
+    imposed = _imposed(jnp.asarray(amplitudes), jnp.asarray(duration, float), t)
+    position = arm.geometry.forward(arm.posture + imposed[0])
+    if arm.yields:
+        q, dq = _through_the_cuff(arm, jnp.asarray(amplitudes), jnp.asarray(duration, float), t)
+        force = _cuff_force(arm, q, dq, position, arm.geometry.velocity(arm.posture + imposed[0], imposed[1]))
+        torque = arm.geometry.joint_torque(q, force)
+        ddq = _acceleration(arm, t, q, dq, torque)
+    else:
+        q, dq, ddq = arm.posture + imposed[0], *imposed[1:]
+        torque = rigid_body_torque(q, dq, ddq, jnp.asarray(arm.inertia)) + _muscles(arm, t, q, dq)
+        force = _hand_force(arm.geometry, q, torque)
     if key is not None:
         keys = jax.random.split(key)
         position += arm.position_noise * jax.random.normal(keys[0], position.shape)
         force += arm.force_noise * jax.random.normal(keys[1], force.shape)
     return HeldTrials(t, position, force, q, dq, ddq, torque)
+
+
+def _imposed(amplitudes: Array, duration: Array, t: Array) -> tuple[Array, Array, Array]:
+    """Displacement, velocity and acceleration (T, N, 2) of the joints if the hand follows the robot."""
+    profile = MinimumJerk(jnp.array([0.0, 1.0]), duration)(t)
+    away, dq, ddq = (jnp.multiply.outer(x, amplitudes).swapaxes(0, 1) for x in profile)
+    return away, dq, ddq
+
+
+def _muscles(arm: HeldArm, t: Array, q: Array, dq: Array) -> Array:
+    """Torque [N m] that holds against damping, stiffness, and what the subject presses with."""
+    D, K = arm.impedance(t)
+    pressed = arm.geometry.joint_torque(arm.posture, arm.hand_force)
+    return (D * dq[..., None, :] + K * (q - arm.posture)[..., None, :]).sum(axis=-1) + pressed
+
+
+def _acceleration(arm: HeldArm, t: Array, q: Array, dq: Array, torque: Array) -> Array:
+    """Of the joints under the torque of an outside force [rad/s^2]."""
+    xi = jnp.asarray(arm.inertia)
+    left = torque - _muscles(arm, t, q, dq) - rigid_body_torque(q, dq, jnp.zeros_like(dq), xi)
+    M = mass_matrix(q, xi)
+    (a, b), (c, d) = (M[..., 0, 0], M[..., 0, 1]), (M[..., 1, 0], M[..., 1, 1])
+    first, second = left[..., 0], left[..., 1]
+    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]
+
+
+def _cuff_force(arm: HeldArm, q: Array, dq: Array, robot: Array, robot_velocity: Array) -> Array:
+    """Force on the hand [N] of a spring and a damper between it and the robot; at rest that of the subject."""
+    apart = robot - arm.geometry.forward(q)
+    slip = robot_velocity - arm.geometry.velocity(q, dq)
+    return arm.hand_force + arm.cuff_stiffness * apart + arm.cuff_damping * slip
+
+
+def _through_the_cuff(arm: HeldArm, amplitudes: Array, duration: Array, t: Array) -> tuple[Array, Array]:
+    """Angles and velocities (T, N, 2) of an arm that the cuff drags along: Runge and Kutta's method, one step a sample.
+
+    The robot's motion is needed between the samples as well; the acceleration of the arm is not.
+    """
+    h = t[1] - t[0]
+
+    def rate(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        q, dq = state
+        away, velocity, _ = (x[:, 0] for x in _imposed(amplitudes, duration, t[None]))
+        robot = arm.geometry.forward(arm.posture + away), arm.geometry.velocity(arm.posture + away, velocity)
+        torque = arm.geometry.joint_torque(q, _cuff_force(arm, q, dq, *robot))
+        return dq, _acceleration(arm, t, q, dq, torque)
+
+    def step(state: tuple[Array, Array], t: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        def moved(by: Array, slope: tuple[Array, Array]) -> tuple[Array, Array]:
+            return state[0] + by * slope[0], state[1] + by * slope[1]
+
+        first = rate(t, state)
+        second = rate(t + h / 2, moved(h / 2, first))
+        third = rate(t + h / 2, moved(h / 2, second))
+        fourth = rate(t + h, moved(h, third))
+        slopes = zip(first, second, third, fourth, strict=True)
+        mean = [(k1 + 2 * k2 + 2 * k3 + k4) / 6 for k1, k2, k3, k4 in slopes]
+        return moved(h, (mean[0], mean[1])), state
+
+    rest = jnp.broadcast_to(jnp.asarray(arm.posture), amplitudes.shape)
+    q, dq = jax.lax.scan(step, (rest, jnp.zeros_like(rest)), t)[1]
+    return q.swapaxes(0, 1), dq.swapaxes(0, 1)
 
 
 def _hand_force(geometry: ArmGeometry, q: Array, torque: Array) -> Array:
