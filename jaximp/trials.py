@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.job import FilterSettings
-from jaximp.least_squares import WindowFit, least_squares
+from jaximp.least_squares import WindowFit, least_squares, variance_accounted_for
 from jaximp.models import ArmGeometry, PlanarArm
 from jaximp.regression import design_filters, filtered
 from jaximp.types import AnyArray, Numbers, Recording
@@ -206,13 +206,33 @@ def fit_trials(
     if not isinstance(rows.peaks, jax.core.Tracer) and not isinstance(counts, jax.core.Tracer):
         _check_directions(np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)])
     rows = rows.at_hand() if at_hand else rows
-    # Half a sample of grace: times are multiples of the sampling interval only up to rounding.
-    grace = (rows.time[1] - rows.time[0]) / 2
-    inside = (rows.time >= -grace) & (rows.time < observed + grace)
-    valid = jnp.broadcast_to(inside, (T, N)) & (True if counts is None else jnp.asarray(counts)[:, None])
     shape = (T * N, n)
-    valid = jnp.broadcast_to(valid.reshape(-1, 1), shape)
+    valid = jnp.broadcast_to(_observed(rows, observed, counts).reshape(-1, 1), shape)
     return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, rows.noise)
+
+
+def predict_trials(
+    rows: TrialRows,
+    theta: Num[AnyArray, " p"],
+    observed: float | Num[AnyArray, ""],
+    counts: Bool[AnyArray, " T"] | None = None,
+) -> tuple[Float[Array, "T N 2"], Float[Array, ""]]:
+    """Torques [N m] that parameters predict, and the variance that they account for in trials they have not seen.
+
+    **Arguments:** `observed` [s] after the onset count; `counts` (T,) True for the trials that were held out.
+    """
+    predicted = rows.W @ jnp.asarray(theta)
+    weight = jnp.broadcast_to(_observed(rows, observed, counts)[..., None], predicted.shape).astype(float)
+    flat = [x.reshape(-1, 2) for x in (rows.torque, rows.torque - predicted, weight)]
+    return predicted, variance_accounted_for(*flat)
+
+
+def _observed(rows: TrialRows, observed: float | AnyArray, counts: AnyArray | None) -> Array:
+    """(T, N) samples from the onset to the end of the observation, of the trials that count."""
+    # Half a sample of grace: times are multiples of the sampling interval only up to rounding.
+    grace = (rows.time[1] - rows.time[0]) / 2 if len(rows.time) > 1 else 0.0
+    inside = (rows.time >= -grace) & (rows.time < observed + grace)
+    return jnp.broadcast_to(inside, rows.W.shape[:2]) & (True if counts is None else jnp.asarray(counts)[:, None])
 
 
 def _check_directions(peaks: Numbers) -> None:

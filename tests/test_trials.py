@@ -16,7 +16,7 @@ from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit
 from jaximp.models import PlanarArm
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
-from jaximp.trials import Trials, fit_trials, joint_trials, read_trials, regress_trials
+from jaximp.trials import Trials, fit_trials, joint_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
 from jaximp.types import Recording
 
@@ -141,6 +141,18 @@ def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Record
     np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
     given = read_trials(read, QUIET.geometry, onset=0.15, before=0.15, after=0.4)
     np.testing.assert_array_equal(given.angles, trials.angles)
+
+
+def test_unseen_trials_are_predicted(held: HeldTrials) -> None:
+    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
+    rows, held_out = regress_trials(ARM, trials, FILTER), np.arange(6) == 5
+    fit = fit_trials(rows, 0.27, ~held_out)
+    predicted, vaf = predict_trials(rows, fit.theta, 0.27, held_out)
+    inside = (np.asarray(rows.time) > -1e-3) & (np.asarray(rows.time) < 0.271)
+    seen, unseen = np.asarray(rows.torque)[5, inside], np.asarray(predicted)[5, inside]
+    expected = 1 - (seen - unseen).var(axis=0).sum() / seen.var(axis=0).sum()
+    assert float(vaf) == pytest.approx(expected, rel=1e-9)
+    assert vaf > 0.99
 
 
 def test_steady_state_is_taken_off(held: HeldTrials) -> None:

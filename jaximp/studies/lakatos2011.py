@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.excitation import Limits
 from jaximp.job import FilterSettings
-from jaximp.least_squares import variance_accounted_for
 from jaximp.models import PlanarArm, rigid_body_torque
 from jaximp.perturbations import condition_of, design_perturbations
 from jaximp.regression import design_filters
 from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold
 from jaximp.trajectories import MinimumJerk, SixthOrder, Trajectory, jerk
-from jaximp.trials import TrialRows, fit_trials, joint_trials, regress_trials
+from jaximp.trials import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence, matrix_criteria
 from jaximp.types import Numbers, Progress
 
@@ -119,14 +118,14 @@ def sweep(arms: HeldArm, keys: Array, durations: Array, inertia: Array) -> Outco
         observed = duration + OBSERVED
         D, K = arm.impedance(jnp.asarray(times()))
         during = jnp.asarray(times() >= 0)[:, None, None] * (times()[:, None, None] <= observed)
-        full = _estimate(rows, observed, 0)
-        rigid = rows.W[..., :3] @ inertia
-        reduced = _estimate(
-            eqx.tree_at(lambda r: (r.W, r.torque), rows, (rows.W[..., 3:], rows.torque - rigid)), observed, 3
-        )
-        reduced = reduced._replace(predicted=reduced.predicted + rigid[HELD_OUT])
+        rest = rows.torque - rows.W[..., :3] @ inertia
+        reduced = eqx.tree_at(lambda r: (r.W, r.torque), rows, (rows.W[..., 3:], rest))
         return Outcome(
-            full, reduced, rows.torque[HELD_OUT], (D * during).sum(0) / during.sum(), (K * during).sum(0) / during.sum()
+            _estimate(rows, rows, observed, jnp.zeros(0)),
+            _estimate(rows, reduced, observed, inertia),
+            rows.torque[HELD_OUT],
+            (D * during).sum(0) / during.sum(),
+            (K * during).sum(0) / during.sum(),
         )
 
     def all_durations(arm_and_key: tuple[HeldArm, PRNGKeyArray]) -> Outcome:
@@ -135,13 +134,12 @@ def sweep(arms: HeldArm, keys: Array, durations: Array, inertia: Array) -> Outco
     return jax.lax.map(all_durations, (arms, keys))
 
 
-def _estimate(rows: TrialRows, observed: Array, known: int) -> Estimate:
-    fit = fit_trials(rows, observed, jnp.arange(len(rows.torque)) != HELD_OUT, at_hand=False)  # as the paper
-    W, torque = rows.W[HELD_OUT], rows.torque[HELD_OUT]
-    inside = ((rows.time >= 0) & (rows.time <= observed)).astype(float)
-    predicted = W @ fit.theta
-    vaf = variance_accounted_for(torque, torque - predicted, jnp.broadcast_to(inside[:, None], torque.shape))
-    return Estimate(fit, vaf, predicted)
+def _estimate(rows: TrialRows, solved: TrialRows, observed: Array, known: Array) -> Estimate:
+    """Parameters from the equations that are `solved`, held against all of the torque with those that are `known`."""
+    held_out = jnp.arange(len(rows.torque)) == HELD_OUT
+    fit = fit_trials(solved, observed, ~held_out, at_hand=False)  # as the paper
+    predicted, vaf = predict_trials(rows, jnp.concatenate([known, fit.theta]), observed, held_out)
+    return Estimate(fit, vaf, predicted[HELD_OUT])
 
 
 def cases(cuff: float | None) -> tuple[HeldArm, Array]:
