@@ -153,12 +153,13 @@ def pendulum() -> dict[str, Any]:
 
     together = fit(list(range(len(files))))
     theta = dict(zip(model.names, np.asarray(together.theta), strict=True))
-    found = {
-        "I1 + m2 l1^2 + rotor": theta["inertia_1"] - theta["inertia_3"],
-        "m2 r2": theta["gravity_2"],
-        "I2": theta["inertia_3"],
-        "m1 r1 + m2 l1": theta["gravity_1"],
+    combined = {
+        "I1 + m2 l1^2 + rotor": {"inertia_1": 1.0, "inertia_3": -1.0},
+        "m2 r2": {"gravity_2": 1.0},
+        "I2": {"inertia_3": 1.0},
+        "m1 r1 + m2 l1": {"gravity_1": 1.0},
     }
+    weights = {name: np.array([of.get(own, 0.0) for own in model.names]) for name, of in combined.items()}
     held_out = {}
     for k, name in enumerate(files):
         W, torque, valid = parts[k]
@@ -167,8 +168,13 @@ def pendulum() -> dict[str, Any]:
     estimates = identify(job)[0]
     residual = np.concatenate([(torque - W @ np.asarray(together.theta))[valid] for W, torque, valid in parts])
     return {
-        name: {"owners": OWNERS[name], "measured": float(x), "relative_difference": float(x / OWNERS[name] - 1)}
-        for name, x in found.items()
+        name: {
+            "owners": OWNERS[name],
+            "measured": float(w @ together.theta),
+            "standard_error": float(np.sqrt(w @ np.asarray(together.covariance) @ w)),
+            "relative_difference": float(w @ together.theta / OWNERS[name] - 1),
+        }
+        for name, w in weights.items()
     } | {
         "parameters": {name: float(x) for name, x in theta.items()},
         "stderr": dict(zip(model.names, np.asarray(together.stderr).tolist(), strict=True)),
