@@ -9,7 +9,7 @@ from jaximp.perturbations import Perturbations, design_perturbations
 from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.recursive import RecursiveFit, recursive_least_squares
 from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
-from jaximp.trials import fit_trials, joint_trials, predict_trials, read_trials, regress_trials
+from jaximp.trials import fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
 from jaximp.types import Recording
 from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
@@ -44,6 +44,7 @@ __all__ = [
     "joint_trials",
     "least_squares",
     "load_recording",
+    "load_trials",
     "models",
     "parse_job",
     "predict_trials",

@@ -6,7 +6,9 @@ before the perturbation, filters without phase, derivatives.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit, least_squares, variance_accounted_for
 from jaximp.models import ArmGeometry, PlanarArm
+from jaximp.recordings import load_recording
 from jaximp.regression import design_filters, filtered
 from jaximp.types import AnyArray, Numbers, Recording
 
@@ -139,6 +142,29 @@ def read_trials(
         position.append(recording.position[part])
         force.append(recording.torque[part])
     return joint_trials(geometry, np.stack(position), np.stack(force), n_before, rate)
+
+
+def load_trials(
+    files: Sequence[str | os.PathLike[str]],
+    geometry: ArmGeometry,
+    model: PlanarArm,
+    settings: FilterSettings,
+    *,
+    onset: float | Sequence[float] | None = None,
+    before: float = 0.1,
+    after: float = 0.5,
+    **mapping: Any,
+) -> TrialRows:
+    """From trial files to rows for least squares, in one call.
+
+    **Arguments:** `mapping` says where the columns are, as in `load_recording`: `time` or `sample_rate`, `position` of
+    the hand [m] and `torque` for the force on it [N], two columns each, and `reference` for what was commanded. The
+    rest as in `read_trials` and `regress_trials`.
+
+    **Raises:** as those three.
+    """
+    recordings = [load_recording(file, joint="prismatic", **mapping) for file in files]
+    return regress_trials(model, read_trials(recordings, geometry, onset, before, after), settings)
 
 
 def find_onset(name: str, recording: Recording) -> int:

@@ -16,7 +16,7 @@ from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit
 from jaximp.models import PlanarArm
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
-from jaximp.trials import Trials, fit_trials, joint_trials, predict_trials, read_trials, regress_trials
+from jaximp.trials import Trials, fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
 from jaximp.types import Recording
 
@@ -128,16 +128,18 @@ def test_standard_errors_are_not_too_small(position_noise: float, least: float) 
 
 
 def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Recording], fitted: WindowFit) -> None:
-    read = []
-    for recording in logged:
-        path = tmp_path / f"trial_{recording.name}.csv"
-        save_recording(recording, path)
-        pairs = {channel: [f"{channel}{j}_{unit}" for j in (1, 2)] for channel, unit in
-                 (("position", "m"), ("torque", "N"), ("reference", "m"))}  # fmt: skip
-        read.append(load_recording(path, time="time_s", joint="prismatic", **pairs))
+    files = [tmp_path / f"trial_{recording.name}.csv" for recording in logged]
+    for file, recording in zip(files, logged, strict=True):
+        save_recording(recording, file)
+    columns: dict[str, Any] = {"time": "time_s"}
+    for channel, unit in (("position", "m"), ("torque", "N"), ("reference", "m")):
+        columns[channel] = [f"{channel}{j}_{unit}" for j in (1, 2)]
+    rows = load_trials(files, QUIET.geometry, ARM, FILTER, before=0.15, after=0.4, **columns)
+    read = [load_recording(file, joint="prismatic", **columns) for file in files]
     trials = read_trials(read, QUIET.geometry, before=0.15, after=0.4)
     assert trials.onset == 150
-    again = fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
+    np.testing.assert_array_equal(rows.W, regress_trials(ARM, trials, FILTER).W)
+    again = fit_trials(rows, 0.27)
     np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
     given = read_trials(read, QUIET.geometry, onset=0.15, before=0.15, after=0.4)
     np.testing.assert_array_equal(given.angles, trials.angles)

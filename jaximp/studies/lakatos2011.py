@@ -56,6 +56,8 @@ SAME = 0.1
 """An estimate is quasi-constant where all of it is within this share of its matrix's norm of the longest window's."""
 LIMITS = TrustLimits(min_vaf=0.9, max_asymmetry=0.05, max_relative_stderr=0.1)
 """What the held-out torque, the antisymmetric part and the standard errors must keep here."""
+TABULATED = (0.05, 0.1, 0.2, 0.3)
+"""T_k of which Table I is printed [s]."""
 WAY_POINTS = 4
 SHORTER = np.array([0.12, 0.17, 0.22, 0.27, 0.32, 0.37, 0.42, 0.47])
 """Observations that perturbations are designed for [s]."""
@@ -208,20 +210,21 @@ def thresholds(kept: NDArray[np.bool_]) -> Numbers:
     return np.where(later.any(axis=-1), DURATIONS[first] + OBSERVED, np.inf)
 
 
-def table_one() -> dict[str, dict[str, Any]]:
-    """Table I for t_f = 1 s: ratios C_ij of mean squares, eq. (17), by quadrature and in closed form (t_f^2, t_f^4)."""
+def table_one(duration: float) -> dict[str, dict[str, Any]]:
+    """Table I for t_f = T_k: ratios C_ij of mean squares, eq. (17), by quadrature and in closed form."""
     t, weights = np.polynomial.legendre.leggauss(7)  # exact for these polynomials
-    at = jnp.asarray((t + 1) / 2)
-    closed = {"fifth order": ("1/12", "1/504", "1/42"), "sixth order": ("3/44", "1/792", "1/54")}
+    at = jnp.asarray(duration * (t + 1) / 2)
+    closed = {"fifth order": (1 / 12, 1 / 504, 1 / 42), "sixth order": (3 / 44, 1 / 792, 1 / 54)}
     motions: dict[str, Trajectory] = {
-        "fifth order": MinimumJerk(jnp.array([0.0, 1.0]), 1.0),
-        "sixth order": SixthOrder(0.0, 1.0, 1.0),
+        "fifth order": MinimumJerk(jnp.array([0.0, 1.0]), duration),
+        "sixth order": SixthOrder(0.0, 1.0, duration),
     }
     found = {}
     for name, motion in motions.items():
         first, second, third = (weights @ np.square(x) for x in (*motion(at)[1:], jerk(motion, at)))
-        ratios = {"C12": first / second, "C13": first / third, "C23": second / third}
-        found[name] = {"numbers": ratios, "closed form": dict(zip(ratios, closed[name], strict=True))}
+        exact = np.array(closed[name]) * duration ** np.array([2, 4, 2])
+        numbers = {"C12": first / second, "C13": first / third, "C23": second / third}
+        found[name] = {"numbers": numbers, "closed form": dict(zip(numbers, exact.tolist(), strict=True))}
     return found
 
 
@@ -284,7 +287,7 @@ def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
     kept = {which: met(outcome, which) for which in ("full", "reduced")}
     tables = {
         "paper": PAPER,
-        "table_1": table_one(),
+        "table_1": {f"{1e3 * duration:.0f} ms": table_one(duration) for duration in TABULATED},
         "thresholds_ms": {
             which: {name: _band(thresholds(values)) for name, values in found.items()} for which, found in kept.items()
         },
@@ -464,10 +467,11 @@ def _markdown(tables: dict[str, Any]) -> str:
     for name in CRITERIA:
         cells = (_in_words(tables["by_cuff_ms"]["full"][name][cuff]) for cuff in cuffs)
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    lines += ["", "| Table I, t_f = 1 s | C12 | C13 | C23 |", "| --- | --- | --- | --- |"]
-    for name, row in tables["table_1"].items():
-        cells = (f"{row['numbers'][c]:.6f} ({row['closed form'][c]})" for c in ("C12", "C13", "C23"))
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", "| Table I: by quadrature (closed form) | C12 | C13 | C23 |", "| --- | --- | --- | --- |"]
+    for duration, rows in tables["table_1"].items():
+        for name, row in rows.items():
+            cells = (f"{row['numbers'][c]:.4g} ({row['closed form'][c]:.4g})" for c in ("C12", "C13", "C23"))
+            lines.append(f"| {name}, t_f = {duration} | {' | '.join(cells)} |")
     one = tables["shorter"]
     lines += [
         "",
