@@ -219,8 +219,12 @@ def _say_result(estimates: Estimates) -> None:
     if not estimates.verdicts.trusted.any():
         typer.echo("no window can be trusted, for example: " + next(filter(None, estimates.verdicts.reason)))
         return
-    for name, unit, mean in zip(estimates.names, estimates.units, estimates.mean_over_trusted(), strict=True):
-        typer.echo(f"{name:>16} {mean:11.4g} {unit}  (mean over the trusted windows)")
+    typer.echo("mean and standard deviation over the trusted windows:")
+    spread = estimates.fit.theta[estimates.verdicts.trusted].std(axis=0)
+    for name, unit, mean, sd in zip(
+        estimates.names, estimates.units, estimates.mean_over_trusted(), spread, strict=True
+    ):
+        typer.echo(f"{name:>20} {mean:11.4g} ({sd:.2g}) {unit}")
 
 
 def _say_where(out: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -168,7 +168,21 @@ def _limits(table: Any) -> Limits:
             return tuple(number(item, where) for item in value)
         return checked(value, float, where)
 
-    given = {name: number(value, f"limits.{name}") for name, value in table.items()}
-    if "position" in given and not (isinstance(given["position"], tuple) and len(given["position"]) == 2):
-        raise ValueError(f"limits.position is {table['position']}: give the lowest and the highest")
+    given = {name: number(value, f"limits.{name}") for name, value in table.items() if name != "position"}
+    if "position" in table:
+        given["position"] = _range(table["position"], number)
     return Limits(**given)
+
+
+def _range(value: Any, number: Callable[[Any, str], Any]) -> tuple[Any, Any]:
+    """`[lowest, highest]` of all joints, or `{ low = [...], high = [...] }` with a number for each."""
+    if isinstance(value, dict):
+        check_keys(value, ["low", "high"], "limits.position")
+        if len(value) == 2:
+            return number(value["low"], "limits.position.low"), number(value["high"], "limits.position.high")
+    elif isinstance(value, list) and len(value) == 2 and not any(isinstance(item, list) for item in value):
+        return number(value[0], "limits.position"), number(value[1], "limits.position")
+    raise ValueError(
+        f"limits.position is {value}: write [lowest, highest], or for joints that differ "
+        "{ low = [joint 1, joint 2], high = [joint 1, joint 2] }"
+    )

@@ -52,6 +52,8 @@ TOUCHING = 1e-12
 """A torque this far below its limit, as a share of it, has reached it."""
 MOST_STEPS = 60
 ROUNDING = 1e-12
+DESCENDING = 16
+"""Windows in the length of one that are looked at while a motion is designed; the result is judged by all."""
 BATCH = 8
 """Starts that are minimised together; several batches at a time, one on each core."""
 ACTIVE = 0.999
@@ -129,6 +131,8 @@ class Design:
     def in_words(self) -> list[str]:
         """What was found, a line for each fact."""
         lines = [f"condition number over a period of {self.period:g} s: {self.condition:.4g}"]
+        if self.objective != "condition":
+            lines.insert(0, self._objective_in_words())
         if math.isnan(self.lower_bound):
             lines.append(f"how far above the least possible: not known ({self.bound_source})")
         else:
@@ -137,12 +141,7 @@ class Design:
                 f"{_above(self.condition, self.lower_bound)} the lower bound {self.lower_bound:.4g} ({source})"
             )
         if self.window is not None:
-            lines.append(f"in the worst window of {self.window:.4g} s: {self.worst_condition:.4g}")
-        if self.objective == "stderr":
-            unit = self.model.units[self.model.names.index(self.parameter or "")]
-            lines.append(f"standard error of {self.parameter} for torque noise of 1 N m: {self.value:.4g} {unit}")
-        elif self.objective != "condition":
-            lines.append(f"{OBJECTIVES[self.objective]}: {self.value:.4g}")
+            lines.append(f"condition number in the worst window of {self.window:.4g} s: {self.worst_condition:.4g}")
         if not self.worst_condition < COLLINEAR:
             lines.append("not all parameters can be told apart: use another objective, or a smaller model")
         lines.append("limits reached: " + (", ".join(self.active) or "none"))
@@ -151,6 +150,14 @@ class Design:
                 "a larger motion would keep the limits: the condition number does not ask for size, stderr does"
             )
         return lines
+
+    def _objective_in_words(self) -> str:
+        where = f"over a period of {self.period:g} s" if self.window is None else f"in windows of {self.window:.4g} s"
+        if self.objective != "stderr":
+            return f"{OBJECTIVES[self.objective]} {where}: {self.value:.4g}"
+        unit = self.model.units[self.model.names.index(self.parameter or "")]
+        noise = "white torque noise of 1 N m in every sample"
+        return f"standard error of {self.parameter} {where}, for {noise}: {self.value:.4g} {unit}"
 
     def sliding_condition(self, length: float) -> tuple[Numbers, Numbers]:
         """Condition number of the regressor in every window of `length` seconds.
@@ -221,8 +228,6 @@ class _Problem(eqx.Module):
 
     def instants(self, finer: int = 1) -> Array:
         """Times of one period, evenly spread."""
-        if self.encoder is not None:
-            return jnp.arange(round(self.samples)) / self.encoder.sample_rate
         count = finer * max(200, PER_CYCLE * self.harmonics)
         return jnp.arange(count) * (self.period / count)
 
@@ -316,13 +321,16 @@ def _problem(
         raise ValueError(f"the model has {model.n_joints} joints, but the one of what is moved {moved.n_joints}")
     _check_motion(harmonics, period, sample_rate, window, rest, encoder)
     _check_objective(model, objective, parameter)
-    low, high, most = _room(limits, model.n_joints)
+    low, high, most = room(limits, model.n_joints)
     if mean is not None:
         mean = jnp.asarray(_per_joint("mean", mean, model.n_joints))
         if not ((low < mean) & (mean < high)).all():
             raise ValueError(f"mean is {mean.tolist()}: it must be inside limits.position")
     if np.isfinite(most[-1]).any() and parameters is None:
-        raise ValueError("limits.torque needs the parameters of the model: pass parameters=...")
+        raise ValueError(
+            f"limits.torque needs the parameters of the model, here {', '.join(moved.names)}: pass parameters=..., or "
+            "write a [parameters] table"
+        )
     scale = jnp.ones(len(model.names)) if scale is None else _per_parameter("scale", scale, model)
     if not (scale > 0).all():
         raise ValueError("scale must be above zero: it is the size of each parameter")
@@ -364,7 +372,10 @@ def _check_objective(model: Model, objective: str, parameter: str | None) -> Non
     if objective not in OBJECTIVES:
         raise ValueError(f"objective is '{objective}': {nearest(objective, list(OBJECTIVES))}")
     if (objective == "stderr") != (parameter is not None):
-        raise ValueError("the objective 'stderr' needs a parameter, and no other objective takes one")
+        raise ValueError(
+            "the objective 'stderr' needs a parameter, and no other objective takes one: parameter may be "
+            + ", ".join(model.names)
+        )
     if parameter is not None and parameter not in model.names:
         raise ValueError(f"parameter is '{parameter}': {nearest(parameter, list(model.names))}")
 
@@ -372,7 +383,7 @@ def _check_objective(model: Model, objective: str, parameter: str | None) -> Non
 _SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
 
 
-def _room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:
+def room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:
     """Lowest and highest position (n,), and the most of everything else (4, n)."""
     low, high = (_per_joint(f"limits.position[{k}]", x, n) for k, x in enumerate(limits.position))
     most = np.stack([_per_joint(f"limits.{name}", getattr(limits, name), n) for name in _SYMMETRIC])
@@ -524,15 +535,23 @@ def _measured(encoder: Encoder, series: FourierSeries, t: Array) -> tuple[Array,
     return tuple(jax.lax.stop_gradient(seen - x) + x for seen, x in zip((smooth, dq, ddq), motion, strict=True))
 
 
-def _grams(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, whole: bool = False) -> Array:
-    """(M, p, p) sums over the period, or over every sliding window, as many as measurements in the same time make."""
-    motion = series(t) if problem.encoder is None else _measured(problem.encoder, series, t)
+def _grams(
+    problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None, whole: bool = False, every: int = 1
+) -> Array:
+    """(M, p, p) sums over the period, or over sliding windows, as many as measurements in the same time make.
+
+    `every` is the number of windows in the length of one: 1 stands for all that there are.
+    """
+    motion: tuple[Array, ...] = series(t)
+    if problem.encoder is not None:
+        t = jnp.arange(round(problem.samples)) / problem.encoder.sample_rate
+        motion = _measured(problem.encoder, series, t)
     rows = _rows(problem.model, motion, smooth) * problem.scale
     products = jnp.einsum("tni,tnj->tij", rows, rows) * (problem.samples / len(t))
     if problem.window is None or whole:
         return products.sum(axis=0)[None]
     length = max(1, round(problem.window * len(t)))
-    return _sliding_sums(products, length)[:: max(1, length // 16)]
+    return _sliding_sums(products, length)[:: max(1, length // every) if every > 1 else 1]
 
 
 def _sliding_sums(products: AnyArray, length: int) -> Array:
@@ -550,7 +569,8 @@ def _worth(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | N
         "sigma_min": log_sigma_min,
         "stderr": partial(log_stderr, parameter=problem.parameter),
     }
-    values = objectives[problem.objective](_grams(problem, series, t, smooth))
+    every = 1 if sharpness is None else DESCENDING
+    values = objectives[problem.objective](_grams(problem, series, t, smooth, every=every))
     return values.max() if sharpness is None else jax.nn.logsumexp(sharpness * values) / sharpness
 
 

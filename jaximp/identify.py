@@ -37,6 +37,9 @@ from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest
 from jaximp.windows import score, sliding_least_squares
 
+STILL = 1e-3
+"""A window whose torque varies by a smaller share of the recording's variance can neither confirm nor refute."""
+
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
@@ -136,6 +139,8 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
     noise = noise_of_rows(job, recording, filters)
     model = robot if human is None else human
     assert model is not None
+    if job.model.arm is not None:
+        _check_elbow(job, recording)
     if robot is None or human is None:
         rows, pair = regress(model, recording, job, filters), None
     else:
@@ -144,6 +149,16 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
         recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair,
         _reference(job, recording),
     )  # fmt: skip
+
+
+def _check_elbow(job: Job, recording: Recording) -> None:
+    """A human's elbow does not turn further than half a turn; degrees that pass for radians do."""
+    assert job.model.arm is not None
+    farthest = float(np.nanmax(np.abs(recording.position[:, 1])))
+    if job.model.arm.equilibrium is not None and farthest > np.pi:
+        raise ValueError(
+            f"the elbow turns to {farthest:.3g} rad, more than half a turn: are these degrees? Give unit = 'deg'"
+        )
 
 
 def in_windows(
@@ -333,7 +348,9 @@ def _estimates(
     recording, model = prepared.recording, prepared.model
     starts, ahead = place.starts[: len(fit.last)], place.next_starts[: len(fit.last)]
     against = partial(score, rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta)
-    held_out = against(ahead, place.window, place.step, place.room).vaf
+    unseen = against(ahead, place.window, place.step, place.room)
+    usual = np.asarray(rows.torque)[np.asarray(rows.valid)].var()
+    held_out = np.where(np.asarray(unseen.variance) > STILL * usual, np.asarray(unseen.vaf), np.nan)
     if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
         seen = against(starts, place.window, place.step, place.room)
         quality = (seen.vaf, seen.residual_rms, seen.samples)

@@ -222,6 +222,8 @@ def model_settings(table: Any) -> ModelSettings:
         if robot is not None or human is not None:
             raise ValueError("model.arm stands alone: leave out model.robot and model.human")
         arm.make()  # refuses what does not go together
+        if "methods" in table:
+            raise ValueError("model.methods tell a human from a robot on one joint: leave them out beside model.arm")
     methods = table.get("methods", [1])
     methods = methods if isinstance(methods, list) else [methods]
     if not methods or any(type(method) is not int or method not in METHODS for method in methods):

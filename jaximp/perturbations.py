@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, Shaped
 
-from jaximp.excitation import Limits
+from jaximp.excitation import Limits, room
 from jaximp.models import PlanarArm, rigid_body_torque
 from jaximp.objectives import log_condition
 from jaximp.optimise import Found, minimise
@@ -26,7 +26,8 @@ from jaximp.types import AnyArray, Numbers
 
 SAMPLES = 120
 """Instants at which a trial is judged."""
-ANYWHERE = Limits()
+FINER = 10
+"""The result keeps its limits on a grid that is so many times finer."""
 MOST_STEPS = 300
 SMALL = 0.01
 """Displacement [rad] of the motions that the optimiser compares: small enough for the arm to be linear."""
@@ -71,31 +72,42 @@ def design_perturbations(
     posture: Num[AnyArray, "2"],
     observed: float,
     inertia: Num[AnyArray, "3"],
+    limits: Limits,
     *,
     trials: int = 6,
     way_points: int = 4,
-    limits: Limits = ANYWHERE,
     starts: int = 8,
     seed: int = 0,
 ) -> Perturbations:
     """Perturbations that tell all parameters of an arm apart in a short observation.
 
     **Arguments:** `posture` (2,) at rest [rad]; `observed` [s] from the onset on; `inertia` (3,) base parameters that
-    bound the torque; `trials` in the set; `way_points` of each after the onset; `limits` of the displacement (the
-    larger end of `position` [rad]), velocity, acceleration and inertial torque.
+    bound the torque; `limits` of the displacement (`position` [rad], from the posture), velocity, acceleration and
+    inertial torque, one number for both joints or one for each; `trials` in the set; `way_points` of each after the
+    onset.
 
-    **Returns:** the best of `starts` sets.
+    **Returns:** the best of `starts` sets, as large as the limits allow.
+
+    **Raises:** `ValueError` for settings that make no sense, displacements without a limit, and a limit of the jerk.
     """
     require_float64()
-    if not observed > 0 or trials < 1 or way_points < 1:
-        raise ValueError("observed must be above zero, and there must be at least one trial and one way point")
+    if not observed > 0 or min(trials, way_points, starts) < 1:
+        raise ValueError("observed must be above zero, and there must be at least one trial, way point and start")
+    posture, inertia = np.asarray(posture, float), np.asarray(inertia, float)
+    if not (np.abs(posture) < 2 * np.pi).all() or not np.isfinite(inertia).all():
+        raise ValueError(f"posture {posture} and inertia {inertia} must be finite, the posture in radians")
+    low, high, most = room(limits, 2)
+    if not (low < 0).all() or not (high > 0).all() or not np.isfinite([low, high]).all():
+        raise ValueError("limits.position is the displacement from the posture: give both ends, such as (-0.05, 0.05)")
+    if np.isfinite(most[2]).any():
+        raise ValueError("limits.jerk is not kept by perturbations: leave it out")
     shape = (trials, way_points, 2)
     x = np.random.default_rng(seed).normal(size=(starts, math.prod(shape)))
     found = _descend(model, jnp.asarray(posture, float), jnp.asarray(observed, float), jnp.asarray(x), shape)
     order = np.argsort(np.asarray(found.value))
     points, condition = _scaled(
         model, jnp.asarray(posture, float), jnp.asarray(observed, float), found.x[order[0]].reshape(shape),
-        jnp.asarray(inertia, float), limits,
+        jnp.asarray(inertia), *(jnp.asarray(x) for x in (low, high, most)),
     )  # fmt: skip
     return Perturbations(np.asarray(points), observed, float(condition), np.exp(np.asarray(found.value)[order]))
 
@@ -112,11 +124,19 @@ def _descend(model: PlanarArm, posture: Array, observed: Array, x: Array, shape:
 
 @eqx.filter_jit
 def _scaled(
-    model: PlanarArm, posture: Array, observed: Array, points: Array, inertia: Array, limits: Limits
+    model: PlanarArm,
+    posture: Array,
+    observed: Array,
+    points: Array,
+    inertia: Array,
+    low: Array,
+    high: Array,
+    most: Array,
 ) -> tuple[Array, Array]:
     """The set as large as its limits allow, and its condition number."""
     points = _from_rest(points)
-    points = points * _largest_factor(posture, _motions(points, observed), inertia, limits)
+    fine = _motions(points, observed, FINER * SAMPLES)
+    points = points * _largest_factor(posture, fine, inertia, low, high, most)
     return points, condition_of(model, posture, _motions(points, observed))
 
 
@@ -124,9 +144,9 @@ def _from_rest(points: Array) -> Array:
     return jnp.concatenate([jnp.zeros_like(points[:, :1]), points], axis=1)
 
 
-def _motions(points: Array, observed: Array) -> tuple[Array, Array, Array]:
-    """Displacement, velocity and acceleration (T, SAMPLES, 2)."""
-    t = observed * jnp.linspace(0.0, 1.0, SAMPLES)
+def _motions(points: Array, observed: Array, samples: int = SAMPLES) -> tuple[Array, Array, Array]:
+    """Displacement, velocity and acceleration (T, samples, 2)."""
+    t = observed * jnp.linspace(0.0, 1.0, samples)
     away, dq, ddq = jax.vmap(lambda one: _chain(one, observed)(t))(points)
     return away, dq, ddq
 
@@ -143,14 +163,15 @@ def _gram(W: Array) -> Array:
     return jnp.einsum("...np,...nq->pq", W, W)
 
 
-def _largest_factor(posture: Array, motions: tuple[Array, ...], inertia: Array, limits: Limits) -> Array:
-    """The factor on all displacements that just keeps the limits; 1 without any."""
+def _largest_factor(
+    posture: Array, motions: tuple[Array, ...], inertia: Array, low: Array, high: Array, most: Array
+) -> Array:
+    """The factor on all displacements that just keeps the limits."""
     away, dq, ddq = motions
-    pairs = [(away, np.max(limits.position)), (dq, limits.velocity), (ddq, limits.acceleration)]
-    share = jnp.stack([(jnp.abs(x) / jnp.asarray(most)).max() for x, most in pairs]).max()
-    factor = jnp.where(share > 0, 1 / share, 1.0)
+    shares = [away / high, away / low, jnp.abs(dq) / most[0], jnp.abs(ddq) / most[1]]
+    factor = 1 / jnp.stack([share.max() for share in shares]).max()
     for _ in range(20):  # the torque is nearly linear in the motion
         q, v, a = posture + factor * away, factor * dq, factor * ddq
-        torque = (jnp.abs(rigid_body_torque(q, v, a, inertia)) / jnp.asarray(limits.torque)).max()
+        torque = (jnp.abs(rigid_body_torque(q, v, a, inertia)) / most[3]).max()
         factor = jnp.where(torque > 1, factor / torque, factor)
     return factor

@@ -23,8 +23,12 @@ from jaximp.recordings import load_recording
 from jaximp.regression import design_filters, filtered
 from jaximp.types import AnyArray, Numbers, Recording
 
-STEADY = 0.02
-"""A command has left its steady state where it differs from it by such a share of its largest difference."""
+STEADY = 0.005
+"""Before the onset, hands and forces drift by no more than such a share of what they do after it."""
+NOISE = 6.0
+"""A command has left its steady state where it differs from it by so many standard deviations of its own noise."""
+LEADING = 0.05
+"""Share of a recording in which the command is steady for certain."""
 
 
 STRAIGHT = 0.05
@@ -87,12 +91,16 @@ def joint_trials(
 ) -> Trials:
     """Angles and torques of the joints from the position of the hand [m] and the force on it [N].
 
-    **Arguments:** all trials begin their perturbation at the sample `onset`; what is before it is the steady state.
+    **Arguments:** positions and forces in the frame of the `geometry`, which says where the shoulder is; all trials
+    begin their perturbation at the sample `onset`, and what is before it is the steady state.
 
-    **Raises:** `ValueError` for positions out of reach, and for an elbow that is nearly straight or folded.
+    **Raises:** `ValueError` for positions out of reach, for an elbow that is nearly straight or folded, for numbers
+    that are not finite, and for a trial that moves before its onset.
 
     **Source:** Lakatos et al. 2011, IV-C.
     """
+    position, force = jnp.asarray(position, float), jnp.asarray(force, float)
+    _check_trials(position, force, onset)
     q = geometry.inverse(position)
     _check_elbow(q)
     torque = geometry.joint_torque(q, force)
@@ -106,14 +114,15 @@ def read_trials(
     recordings: Sequence[Recording],
     geometry: ArmGeometry,
     onset: float | Sequence[float] | None = None,
-    before: float = 0.1,
+    before: float = 0.2,
     after: float = 0.5,
 ) -> Trials:
     """Trials from recordings of the hand, one each: joints `("prismatic", "prismatic")`, positions [m], forces [N].
 
     **Arguments:** `onset` of the perturbation [s] in each recording's own time; where it is not given it is found in
     the `reference` of the recording, the position or force that was commanded. `before` and `after` [s] are kept around
-    it; the mean of `before` is the steady state.
+    it; the mean of `before` is the steady state, and its error is not in the standard errors: at 0.2 s they are some 15
+    to 30 % too small for it.
 
     **Raises:** `ValueError` that names the trial, for one that has no onset, is too short around it, has gaps there, is
     no recording of a hand in a plane, or was sampled at another rate.
@@ -121,7 +130,12 @@ def read_trials(
     if not recordings:
         raise ValueError("there are no trials: give at least one recording")
     rate = recordings[0].sample_rate
-    onsets = np.broadcast_to(np.nan if onset is None else np.asarray(onset, float), len(recordings))
+    given_onsets = np.asarray(np.nan if onset is None else onset, float)
+    if given_onsets.shape not in ((), (len(recordings),)):
+        raise ValueError(
+            f"onset has {given_onsets.size} numbers for {len(recordings)} trials: give one, or one for each"
+        )
+    onsets = np.broadcast_to(given_onsets, len(recordings))
     n_before, n_after = round(before * rate), round(after * rate)
     if n_before < 2 or n_after < 2:
         raise ValueError(f"{before:g} s before the onset and {after:g} s after it are no two samples each: keep more")
@@ -151,7 +165,7 @@ def load_trials(
     settings: FilterSettings,
     *,
     onset: float | Sequence[float] | None = None,
-    before: float = 0.1,
+    before: float = 0.2,
     after: float = 0.5,
     **mapping: Any,
 ) -> TrialRows:
@@ -168,16 +182,21 @@ def load_trials(
 
 
 def find_onset(name: str, recording: Recording) -> int:
-    """Index of the last sample at which the commanded position or force is still what it was at the beginning."""
+    """Index of the last sample at which the commanded position or force is still what it was at the beginning, within
+    the noise that it has there."""
     command = recording.reference
     if command is None:
         raise ValueError(
             f"{name}: its onset is not known: pass onset=, or map the commanded position or force as the reference"
         )
-    away = np.abs(command - command[0]).max(axis=1)
-    if not (away > 0).any():
-        raise ValueError(f"{name}: no perturbation was found, its command is constant: leave it out, or pass onset=")
-    return max(0, int(np.argmax(away > STEADY * away.max())) - 1)
+    leading = command[: max(10, round(LEADING * len(command)))]
+    away = np.abs(command - np.nanmean(leading, axis=0)).max(axis=1)
+    left = away > max(NOISE * float(np.nanstd(leading, axis=0).max()), 1e-9 * float(np.nanmax(away)))
+    # One sample beyond may be a spike: the command stays away for a while.
+    left = left & np.append(left[1:], False) & np.append(left[2:], [False, False])
+    if not left.any():
+        raise ValueError(f"{name}: no perturbation was found in its command: leave it out, or pass onset=")
+    return max(0, int(np.argmax(left)) - 1)
 
 
 def _check_hand(name: str, recording: Recording, rate: float) -> None:
@@ -195,9 +214,19 @@ def _check_hand(name: str, recording: Recording, rate: float) -> None:
 def regress_trials(model: PlanarArm, trials: Trials, settings: FilterSettings) -> TrialRows:
     """Filter every trial and evaluate the model on it, with the trial's own equilibrium in place of the model's.
 
+    **Raises:** `ValueError` for a model without impedance, and for filters that do not suit trials: they need a
+    `decimation_cutoff`, or the noise of the acceleration would bias everything, and no high-pass.
+
     **Source:** Lakatos et al. 2011, eqs. (12), (13).
     """
 
+    if model.equilibrium is None:
+        raise ValueError("trials tell of damping and stiffness: make the arm with PlanarArm((0, 0)) or without inertia")
+    if settings.decimation_cutoff is None or settings.high_pass is not None or settings.mode != "once":
+        raise ValueError(
+            "trials need filter.decimation_cutoff (such as 25 Hz), without which noise of the position biases "
+            "everything, and neither a high-pass nor filters inside windows"
+        )
     filters = design_filters(settings, trials.sample_rate)
 
     def one(q: Array, torque: Array, equilibrium: Array) -> tuple[Array, Array]:
@@ -224,12 +253,20 @@ def fit_trials(
     the equations accordingly. Without it the joints' torques count alike, as in the paper, and standard errors are up
     to 1.4 times too small or too large.
 
+    **Returns:** a `WindowFit`. At the hand its `cond`, `vaf` and `residual_rms` [N] are those of the hand's equations;
+    the paper's condition number (19) is that without `at_hand`.
+
     **Raises:** `ValueError` for fewer rows than parameters, and for directions that do not span the plane.
     """
     T, N, n, p = rows.W.shape
+    if counts is not None and np.shape(counts) != (T,):
+        raise ValueError(f"counts has shape {np.shape(counts)}: give True or False for each of {T} trials")
     if T * N * n < p:
         raise ValueError(f"{T} trials of {N} samples cannot determine {p} parameters: record more, or observe longer")
-    if not isinstance(rows.peaks, jax.core.Tracer) and not isinstance(counts, jax.core.Tracer):
+    if not any(isinstance(x, jax.core.Tracer) for x in (rows.peaks, counts, observed)):
+        longest = float(rows.time[-1])
+        if not 0 < float(observed) <= longest + 1.5 * float(rows.time[1] - rows.time[0] if N > 1 else 0):
+            raise ValueError(f"observed is {float(observed):g} s, but the trials last {longest:.4g} s after the onset")
         _check_directions(np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)])
     rows = rows.at_hand() if at_hand else rows
     shape = (T * N, n)
@@ -268,6 +305,36 @@ def _check_directions(peaks: Numbers) -> None:
         raise ValueError(
             f"the directions of {len(peaks)} trials do not span the plane of the two joints: perturb in at least two "
             "directions"
+        )
+
+
+def _check_trials(position: Array, force: Array, onset: int) -> None:
+    """Shapes, numbers, and a steady state before the onset."""
+    if position.ndim != 3 or position.shape[-1] != 2 or force.shape != position.shape:
+        raise ValueError(
+            f"position has shape {position.shape} and force {force.shape}: both must be (trials, samples, 2)"
+        )
+    if not 4 <= onset < position.shape[1] - 1:
+        raise ValueError(
+            f"onset is sample {onset} of {position.shape[1]}: it must leave a steady state of four before it"
+        )
+    if isinstance(position, jax.core.Tracer) or isinstance(force, jax.core.Tracer):
+        return
+    for name, x in (("position", np.asarray(position)), ("force", np.asarray(force))):
+        bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))
+        if len(bad):
+            raise ValueError(f"trial {bad[0] + 1}: its {name} is not finite everywhere: leave it out")
+    x, quarter = np.asarray(position), max(2, onset // 4)
+    first, last = x[:, :quarter], x[:, onset - quarter : onset]
+    drift = np.abs(last.mean(axis=1) - first.mean(axis=1)).max(axis=1)
+    noise = np.sqrt((first.var(axis=1) + last.var(axis=1)).max(axis=1) / quarter)
+    farthest = np.abs(x[:, onset:] - x[:, :onset].mean(axis=1, keepdims=True)).max(axis=(1, 2))
+    moving = np.flatnonzero((drift > STEADY * farthest) & (drift > NOISE * noise))
+    if len(moving):
+        k = moving[0]
+        raise ValueError(
+            f"trial {k + 1} moves before its onset, by {drift[k]:.2g} m of {farthest[k]:.2g} m: the onset is late, or "
+            "the hand was not at rest; pass an earlier onset="
         )
 
 

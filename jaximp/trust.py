@@ -35,7 +35,8 @@ class TrustLimits:
     min_dof: float = 3.0
     """Fewest degrees of freedom: with less a standard error is itself a matter of luck."""
     max_negative_inertia: float = 5.0
-    """How far below zero an inertia may come out, in standard errors; beyond, torque's sign or model is wrong."""
+    """How far below zero an inertia or a friction may come out, in standard errors; beyond, torque's sign or model is
+    wrong."""
     max_relative_stderr: float = 0.2
     """Largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
     min_excitation_ratio: float = 5.0
@@ -46,7 +47,8 @@ class TrustLimits:
     max_asymmetry: float = 0.2
     """Of an arm's stiffness: antisymmetric over symmetric part (Lakatos et al. 2011, eq. 22), if it is beyond error."""
     errors_apart: float = 2.0
-    """A matrix is not positive definite, or not symmetric, if that is so by so many standard errors."""
+    """A window's matrix is not positive definite, or not symmetric, if that is so by so many standard errors; and it is
+    surely positive definite (`confidence`) by so many."""
     max_condition: float | None = None
     """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
     parameters: tuple[str, ...] = ()
@@ -86,6 +88,10 @@ class MatrixCriteria:
     def positive_definite(self) -> NDArray[np.bool_]:
         """(M,) eq. (20)."""
         return self.eigenvalues[:, 0] > 0
+
+    def surely_definite(self, errors: float) -> NDArray[np.bool_]:
+        """(M,) positive definite by so many standard errors."""
+        return self.eigenvalues[:, 0] > errors * self.eigenvalue_stderr[:, 0]
 
     def surely_indefinite(self, errors: float) -> NDArray[np.bool_]:
         """(M,) not positive definite by so many standard errors."""
@@ -139,9 +145,34 @@ def matrix_criteria(
     )
 
 
+def impossible_body(
+    names: Sequence[str], theta: Num[AnyArray, "M p"], stderr: Num[AnyArray, "M p"], errors: float
+) -> NDArray[np.bool_]:
+    """(M,) whether an arm's base inertial parameters belong to no rigid body, by so many standard errors.
+
+    With `inertia_1 = I_1 + m_2 l1^2 + I_2`, `inertia_2 = m_2 c_2 l1`, `inertia_3 = I_2`: the last is above zero, so is
+    the second (a forearm lies beyond the elbow), and `(inertia_1 - inertia_3) inertia_3 > inertia_2^2`, without which
+    the mass matrix is not positive definite.
+    """
+    wanted = [f"inertia_{k}" for k in (1, 2, 3)]
+    if not set(wanted) <= set(names):
+        return np.zeros(len(theta), bool)
+    index = [list(names).index(name) for name in wanted]
+    (first, second, third), error = np.asarray(theta)[:, index].T, np.asarray(stderr)[:, index].T
+    margin = (first - third) * third - second**2
+    slope = np.stack([third, -2 * second, first - 2 * third])
+    spread = np.sqrt(((slope * error) ** 2).sum(axis=0))
+    with np.errstate(invalid="ignore"):
+        found = np.stack([third / error[2], second / error[1], margin / spread])
+        return np.asarray((found < -errors).any(axis=0))
+
+
 @dataclass(frozen=True)
 class Confidence:
     """Whether to trust the impedance of an arm, of M estimates: one verdict and its parts.
+
+    It does not know where the shoulder is, how long the arm is, or when the perturbation began: wrong ones of these
+    give matrices that look as good as any.
 
     **Source:** Lakatos et al. 2011, III-C, eqs. (19), (20), (22); standard errors and the prediction of unseen torque
     go beyond it.
@@ -153,6 +184,12 @@ class Confidence:
     damping: MatrixCriteria
     relative_stderr: Numbers
     """(M,) largest standard error of an element, as a share of its matrix's norm."""
+    dof: Numbers
+    """(M,) degrees of freedom of the standard errors."""
+    body: NDArray[np.bool_]
+    """(M,) a rigid body can have this inertia (`impossible_body`)."""
+    vaf: Numbers
+    """(M,) share of the torque's variance that the estimate explains."""
     held_out_vaf: Numbers
     """(M,) share of the variance of unseen torque that is predicted."""
     limits: TrustLimits
@@ -163,11 +200,14 @@ class Confidence:
         most = np.inf if self.limits.max_condition is None else self.limits.max_condition
         return {
             "condition": self.condition <= most,
-            "stiffness positive definite": self.stiffness.positive_definite(),
-            "damping positive definite": self.damping.positive_definite(),
+            "inertia of a rigid body": self.body,
+            "stiffness positive definite": self.stiffness.surely_definite(self.limits.errors_apart),
+            "damping positive definite": self.damping.surely_definite(self.limits.errors_apart),
             "stiffness quasi-symmetric": self.stiffness.quasi_symmetric(self.limits),
             "damping quasi-symmetric": self.damping.quasi_symmetric(self.limits),
-            "standard errors": self.relative_stderr <= self.limits.max_relative_stderr,
+            "standard errors": (self.relative_stderr <= self.limits.max_relative_stderr)
+            & (self.dof >= self.limits.min_dof),
+            "explained torque": self.vaf >= self.limits.min_vaf,
             "held-out torque": self.held_out_vaf >= self.limits.min_vaf,
         }
 
@@ -185,8 +225,10 @@ class Confidence:
             share, error = found.asymmetry[k], found.asymmetry_stderr[k]
             lines.append(f"{which}: antisymmetric part {share:.1%} ± {error:.1%} of the symmetric one")
         lines.append(f"largest standard error {self.relative_stderr[k]:.1%} of the matrix")
-        lines.append(f"unseen torque predicted to {self.held_out_vaf[k]:.1%}")
+        lines.append(f"torque explained to {self.vaf[k]:.1%}, unseen torque predicted to {self.held_out_vaf[k]:.1%}")
         failed = [name for name, kept in self.parts.items() if not kept[k]]
+        if self.stiffness.eigenvalues[k, 1] < 0 and self.damping.eigenvalues[k, 1] < 0:
+            failed.append("everything is negative (does the force need sign = -1?)")
         return [*lines, f"not met: {', '.join(failed)}" if failed else "trusted"]
 
 
@@ -199,7 +241,7 @@ def confidence(
     """Judge the estimates of an arm with damping and stiffness, of one window or of M.
 
     **Arguments:** `names` (p) of the parameters; `held_out_vaf`, variance accounted for in trials or windows that the
-    estimates have not seen.
+    estimates have not seen, as `predict_trials` and `identify` measure it.
 
     **Raises:** `ValueError` for a model without an arm's damping and stiffness.
     """
@@ -215,9 +257,11 @@ def confidence(
     for which in ("stiffness", "damping"):
         index = [k for k, name in enumerate(names) if name.startswith(f"{which}_")]
         shares.append(stderr[:, index].max(axis=1) / np.linalg.norm(theta[:, index], axis=1))
-    return Confidence(
-        np.atleast_1d(fit.cond), K, D, np.max(shares, axis=0), np.atleast_1d(np.asarray(held_out_vaf)), limits
+    cond, dof, vaf, unseen = (
+        np.broadcast_to(np.asarray(x), len(theta)) for x in (fit.cond, fit.dof, fit.vaf, held_out_vaf)
     )
+    body = ~impossible_body(names, theta, stderr, limits.errors_apart)
+    return Confidence(cond, K, D, np.max(shares, axis=0), dof, body, vaf, unseen, limits)
 
 
 @dataclass(frozen=True)
@@ -265,8 +309,8 @@ def judge(
        regressor.
     3. *fake change*: the condition number is above the threshold of eqs. (16), (17), where one is given.
     4. *poor fit*: the model explains too little of the torque, or much less than in other windows, or gives a negative
-       inertia, or an arm's stiffness or damping that is surely not positive definite, or a stiffness that is surely not
-       symmetric (`matrix_criteria`).
+       inertia or friction, or an arm's inertia, stiffness or damping that cannot be (`impossible_body`,
+       `matrix_criteria`).
 
     **Arguments:** `names` (p) of the parameters; `window_samples` torque samples in a full window;
     `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
@@ -348,6 +392,15 @@ def judge(
             ),
         )
     )
+    friction = np.array([name.rstrip("_12").endswith(("viscous_friction", "coulomb_friction")) for name in names])
+    drives = np.where(friction, -theta / stderr, -np.inf)
+    rules.append(
+        (
+            drives.max(axis=1) > limits.max_negative_inertia,
+            POOR,
+            lambda k: f"{names[int(drives[k].argmax())]} is negative, by {drives[k].max():.2g} standard errors",
+        )
+    )
     rules += _matrix_rules(fit, names, limits)
     broken = np.stack([mask for mask, _, _ in rules])
     first = np.where(broken.any(axis=0), broken.argmax(axis=0), len(rules))
@@ -366,13 +419,18 @@ def _matrix_rules(fit: SlidingFit, names: tuple[str, ...], limits: TrustLimits) 
             lambda k: f"the {which} is not positive definite: its smallest eigenvalue is {found.eigenvalues[k, 0]:.3g}",
         )
 
-    rules = []
-    for which in ("stiffness", "damping"):
-        found = matrix_criteria(names, which, fit.theta, fit.stderr)
-        if found is not None:
-            rules.append(indefinite(which, found))
-    stiffness = matrix_criteria(names, "stiffness", fit.theta, fit.stderr)
+    stiffness, damping = (matrix_criteria(names, which, fit.theta, fit.stderr) for which in ("stiffness", "damping"))
+    rules: list[Rule] = [
+        (
+            impossible_body(names, fit.theta, fit.stderr, limits.errors_apart),
+            POOR,
+            lambda k: "no rigid body has this inertia: are the joints swapped, or the angles in other units?",
+        )
+    ]
+    if damping is not None:
+        rules.append(indefinite("damping", damping))
     if stiffness is not None:
+        rules.append(indefinite("stiffness", stiffness))
         rules.append(
             (
                 stiffness.surely_asymmetric(limits),

@@ -306,6 +306,8 @@ class Score(eqx.Module):
     """Root of the mean squared residual [N m]."""
     samples: Int[Array, "*M"]
     """Torque samples that counted."""
+    variance: Float[Array, "*M"]
+    """Of the torque [N^2 m^2]."""
 
 
 def score(
@@ -341,7 +343,11 @@ def _score_all(W: Array, y: Array, valid: Array, theta: Array, start: Array, win
         n = weight.sum()
         complete = (first + window <= len(W)) & (n >= 0.5 * window * math.prod(y.shape[1:]))
         vaf = jnp.where(complete, variance_accounted_for(torque, residual, weight), jnp.nan)
-        return Score(vaf, jnp.sqrt((residual**2).sum() / n), n.astype(int))
+        rms = jnp.sqrt((residual**2).sum() / n)
+        torque = jnp.where(weight > 0, torque, 0)
+        mean = (weight * torque).sum(axis=0) / jnp.maximum(weight.sum(axis=0), 1)
+        variance = (weight * (torque - mean) ** 2).sum() / jnp.maximum(n, 1)
+        return Score(vaf, rms, n.astype(int), variance)
 
     padded = _with_room((W, y, valid), room)
     return map_windows(one, (theta, start), room * math.prod(W.shape[1:]))

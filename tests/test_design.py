@@ -108,7 +108,7 @@ def test_what_is_no_design_is_refused(tmp_path: Path, text: str) -> None:
         ("harmonics = 4", "harmonic = 4", "did you mean 'harmonics'"),
         ("harmonics = 4", 'harmonics = "4"', "design.harmonics is '4': it must be a whole number"),
         ("harmonics = 4", 'method = "bgfs"', "did you mean 'bfgs'"),
-        ("[-10.5, 10.5]", "10.5", "give the lowest and the highest"),
+        ("[-10.5, 10.5]", "10.5", "write .lowest, highest."),
         ("velocity = 12", 'velocity = "fast"', "limits.velocity is 'fast': it must be a number"),
         ("inertia = 1.9e-5\n", "", "has no 'inertia'"),
         ("inertia = 1.9e-5", "mass = 1", "unknown key 'mass'"),
@@ -139,3 +139,22 @@ def test_the_human_in_a_known_robot() -> None:
     assert 0.99 * 0.012 < np.abs(design.sampled(2400)["torque"]).max() < 0.012 * (1 + 1e-4)
     with pytest.raises(ValueError, match="identify"):
         parse_design_job(JOB + 'identify = "human"')
+
+
+@pytest.mark.parametrize(
+    ("position", "found"),
+    [
+        ("[-0.3, 0.5]", (-0.3, 0.5)),
+        ("{ low = [-0.3, 0.1], high = [0.3, 1.5] }", ((-0.3, 0.1), (0.3, 1.5))),
+        ("[[-0.3, 0.3], [0.1, 1.5]]", None),
+        ("{ low = -0.3 }", None),
+    ],
+    ids=["all joints", "each joint", "ambiguous", "one end"],
+)
+def test_limits_of_several_joints_say_which_end_they_are(position: str, found: object) -> None:
+    text = f"[model]\nhuman = true\n[limits]\nposition = {position}"
+    if found is None:
+        with pytest.raises(ValueError, match="low = "):
+            parse_design_job(text)
+    else:
+        assert parse_design_job(text).limits.position == found

@@ -203,7 +203,8 @@ def test_a_design_says_what_it_does_not_do() -> None:
     limits = Limits(position=(-0.5, 0.5))
     still = design_excitation(HUMAN, limits=limits, objective="stderr", parameter="stiffness", starts=4)
     assert any("not all parameters can be told apart" in line for line in still.in_words())
-    assert any(line.startswith("standard error of stiffness") and line.endswith("N m/rad") for line in still.in_words())
+    assert still.in_words()[0].startswith("standard error of stiffness over a period of 10 s")
+    assert still.in_words()[0].endswith("N m/rad")
     offset = design_excitation(HumanJoint(), limits=Limits(position=(-5.0, 5.0)), starts=8)
     assert any("larger motion" in line for line in offset.in_words())
     assert any(line.startswith("at the lower bound 1.732") for line in offset.in_words())
@@ -228,6 +229,13 @@ def test_condition_over_sliding_windows() -> None:
     for k in (0, 7, len(end) - 1):
         last = len(end) + k
         assert found[k] == pytest.approx(np.linalg.cond(W[last + 1 - n : last + 1]), rel=1e-9)
+
+
+def test_a_slow_encoder_does_not_hide_a_limit() -> None:
+    limits = Limits(position=(-0.3, 0.3))
+    encoder = Encoder(step=1e-3, sample_rate=3.0, cutoff=1.0, order=2)
+    design = design_excitation(HUMAN, limits=limits, encoder=encoder, starts=4)
+    assert np.abs(design.sampled(2400)["position"]).max() <= 0.3 * (1 + 1e-6)
 
 
 def test_what_is_moved_may_be_more_than_what_is_identified() -> None:

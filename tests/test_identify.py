@@ -322,6 +322,17 @@ def test_bad_arms_are_refused(text: str, why: str) -> None:
         parse_job(text)
 
 
+def test_degrees_and_swapped_joints_are_not_believed() -> None:
+    good = arm_recording(np.array([[29.0, 14.4], [14.4, 17.1]]))
+    with pytest.raises(ValueError, match="degrees"):
+        identify_recording(parse_job(ARM), replace(good, position=np.rad2deg(good.position)))
+    with pytest.raises(ValueError, match="degrees"):
+        parse_job(ARM.replace("[0, 1]", "[0, 57]"))
+    swapped = replace(good, position=good.position[:, ::-1], torque=good.torque[:, ::-1])
+    verdicts = identify_recording(parse_job(ARM.replace("[0, 1]", "[1, 0]")), swapped)[0].verdicts
+    assert not verdicts.trusted.any()
+
+
 def test_an_arm_needs_two_joints() -> None:
     one = arm_recording(np.eye(2))
     one = replace(one, position=one.position[:, :1], torque=one.torque[:, :1], joints=("revolute",))

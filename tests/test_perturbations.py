@@ -47,7 +47,7 @@ def test_condition_of_the_papers_motions_is_an_independent_one() -> None:
 
 def test_designed_perturbations_keep_their_limits_and_are_better_conditioned() -> None:
     limits = Limits(position=(-0.05, 0.05), velocity=0.3, torque=1.0)
-    found = design_perturbations(ARM, POSTURE, 0.3, INERTIA, way_points=3, starts=2, limits=limits)
+    found = design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits, way_points=3, starts=2)
     assert found.points.shape == (6, 4, 2)
     t = np.linspace(0, 0.3, 301)
     motions = [found.motion(k, t) for k in range(6)]
@@ -65,4 +65,28 @@ def test_designed_perturbations_keep_their_limits_and_are_better_conditioned() -
 @pytest.mark.usefixtures("unchecked")
 def test_a_design_without_time_is_refused() -> None:
     with pytest.raises(ValueError, match="observed"):
-        design_perturbations(ARM, POSTURE, 0.0, INERTIA)
+        design_perturbations(ARM, POSTURE, 0.0, INERTIA, Limits(position=(-0.05, 0.05)))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        (Limits(), "displacement from the posture"),
+        (Limits(position=(0.5, 1.5)), "displacement from the posture"),
+        (Limits(position=(-0.05, 0.05), velocity=-1.0), "velocity"),
+        (Limits(position=(-0.05, 0.05), jerk=10.0), "jerk"),
+    ],
+    ids=["none", "absolute", "negative", "jerk"],
+)
+def test_perturbations_have_limits(limits: Limits, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits)
+
+
+def test_every_joint_and_direction_has_its_own_limit() -> None:
+    limits = Limits(position=((-0.01, -0.02), (0.05, 0.03)))
+    found = design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits, way_points=3, starts=2)
+    away = np.stack([np.asarray(found.motion(k, np.linspace(0, 0.3, 777))[0]) for k in range(6)])
+    assert (away >= np.array([-0.01, -0.02]) * 1.001).all()
+    assert (away <= np.array([0.05, 0.03]) * 1.001).all()

@@ -14,7 +14,7 @@ import pytest
 from jaximp import load_recording, recording_from_arrays, save_recording
 from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit
-from jaximp.models import PlanarArm
+from jaximp.models import ArmGeometry, PlanarArm
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
 from jaximp.trials import Trials, fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
@@ -31,8 +31,9 @@ FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cuto
 
 
 def recordings(trials: HeldTrials) -> list[Recording]:
-    """As a robot would log them: the command steps at the onset."""
-    commanded = np.where(TIME > 0, 1.0, 0.0)[:, None] * np.ones(2)
+    """As a robot would log them: the command is the smooth motion itself, which hardly leaves rest at the onset."""
+    u = np.clip(TIME / 0.2, 0, 1)
+    commanded = (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * np.ones(2)
     return [
         recording_from_arrays(
             time=TIME - TIME[0],
@@ -181,13 +182,14 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
         pytest.param(lambda r: [r[0], resampled(r[1])], "sampled at 500 Hz", id="rate"),
         pytest.param(lambda r: [gap(r[0])], "gap around its onset", id="gap"),
         pytest.param(lambda r: [], "no trials", id="none"),
+        pytest.param(lambda r: [r[0], late(r[1], 0.05)], "trial 2 moves before its onset", id="late onset"),
         pytest.param(lambda r: [moved(r[0], 1.0)], "reach", id="out of reach"),
         pytest.param(lambda r: [moved(r[0], 0.0, straight=True)], "trial 1: the elbow", id="straight elbow"),
     ],
 )
 def test_bad_trials_are_named(logged: list[Recording], spoil: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        read_trials(spoil(logged), QUIET.geometry, after=0.4)
+        read_trials(spoil(logged), QUIET.geometry, before=0.15, after=0.35)
 
 
 def shortened(recording: Recording, n: int) -> Recording:
@@ -198,6 +200,18 @@ def shortened(recording: Recording, n: int) -> Recording:
 def resampled(recording: Recording) -> Recording:
     names = ("time", "position", "torque", "valid", "reference")
     return replace(recording, **{name: getattr(recording, name)[::2] for name in names})
+
+
+def late(recording: Recording, by: float) -> Recording:
+    """The command is logged so much later than it acts."""
+    assert recording.reference is not None
+    n = round(by * RATE)
+    shifted = np.concatenate([np.repeat(recording.reference[:1], n, axis=0), recording.reference[:-n]])
+    both = {name: np.concatenate([getattr(recording, name), np.repeat(getattr(recording, name)[-1:], 100, axis=0)])
+            for name in ("position", "torque", "valid")}  # fmt: skip
+    time = np.arange(len(recording) + 100) / RATE
+    shifted = np.concatenate([shifted, np.repeat(shifted[-1:], 100, axis=0)])
+    return replace(recording, time=time, reference=shifted, **both)
 
 
 def gap(recording: Recording) -> Recording:
@@ -265,6 +279,10 @@ def test_confidence_is_one_verdict_with_its_parts(fitted: WindowFit) -> None:
         pytest.param({10: -1.0}, TrustLimits(), 0.99, "stiffness positive definite", id="indefinite"),
         pytest.param({3: -1.0}, TrustLimits(), 0.99, "damping positive definite", id="negative damping"),
         pytest.param({8: 30.0}, TrustLimits(), 0.99, "stiffness quasi-symmetric", id="asymmetric"),
+        pytest.param({1: -0.03}, TrustLimits(), 0.99, "inertia of a rigid body", id="impossible body"),
+        pytest.param({1: 0.3}, TrustLimits(), 0.99, "inertia of a rigid body", id="indefinite mass matrix"),
+        pytest.param({}, TrustLimits(min_dof=1e6), 0.99, "standard errors", id="degrees of freedom"),
+        pytest.param({}, TrustLimits(min_vaf=0.9999999), 1.0, "explained torque", id="explained"),
         pytest.param({}, TrustLimits(max_condition=10.0), 0.99, "condition", id="condition"),
         pytest.param({}, TrustLimits(max_relative_stderr=1e-6), 0.99, "standard errors", id="errors"),
         pytest.param({}, TrustLimits(), 0.5, "held-out torque", id="held out"),
@@ -282,6 +300,52 @@ def test_every_criterion_can_fail(
     assert not found.trusted[0]
     assert not found.parts[part][0]
     assert part in found.in_words()[-1]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        pytest.param(lambda x, f: joint_trials(QUIET.geometry, x, f, 0, RATE), "onset is sample 0", id="no baseline"),
+        pytest.param(lambda x, f: joint_trials(QUIET.geometry, x, f, 5000, RATE), "onset is sample 5000", id="late"),
+        pytest.param(lambda x, f: joint_trials(QUIET.geometry, x[0], f[0], 150, RATE), "must be .trials", id="shape"),
+        pytest.param(
+            lambda x, f: joint_trials(QUIET.geometry, x.at[2, 7].set(np.nan), f, 150, RATE), "trial 3: its position",
+            id="NaN",
+        ),
+        pytest.param(
+            lambda x, f: regress_trials(ARM, joint_trials(QUIET.geometry, x, f, 150, RATE), FilterSettings()),
+            "decimation_cutoff", id="no filter",
+        ),
+        pytest.param(
+            lambda x, f: regress_trials(
+                PlanarArm(impedance=False), joint_trials(QUIET.geometry, x, f, 150, RATE), FILTER
+            ),
+            "damping and stiffness", id="no impedance",
+        ),
+        pytest.param(lambda x, f: fit_trials(rows_of(x, f), 300.0), "observed is 300 s", id="milliseconds"),
+        pytest.param(lambda x, f: fit_trials(rows_of(x, f), 0.2, np.array([0, 1])), "each of 6 trials", id="counts"),
+    ],
+)  # fmt: skip
+def test_wrong_use_is_refused(held: HeldTrials, call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(held.position, held.force)
+
+
+def rows_of(position: Any, force: Any) -> Any:
+    return regress_trials(ARM, joint_trials(QUIET.geometry, position, force, 150, RATE), FILTER)
+
+
+def test_observations_are_a_batch(held: HeldTrials) -> None:
+    rows = rows_of(held.position, held.force)
+    together = jax.jit(jax.vmap(lambda observed: fit_trials(rows, observed).theta))(jnp.array([0.2, 0.27]))
+    np.testing.assert_allclose(together[1], fit_trials(rows, 0.27).theta, rtol=1e-9)
+
+
+def test_the_shoulder_may_be_anywhere(held: HeldTrials, fitted: WindowFit) -> None:
+    moved = ArmGeometry(QUIET.lengths, shoulder=(0.4, -0.2))
+    trials = joint_trials(moved, held.position + np.array([0.4, -0.2]), held.force, 150, RATE)
+    np.testing.assert_allclose(fit_trials(regress_trials(ARM, trials, FILTER), 0.27).theta, fitted.theta, rtol=1e-8)
 
 
 def test_confidence_needs_an_arm(fitted: WindowFit) -> None:

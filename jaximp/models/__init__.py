@@ -12,7 +12,7 @@ from jaximp.models.arm import (
 )
 from jaximp.models.base import MOTION, Combined, Joints, Model, Stacked, combine
 from jaximp.models.joint import HumanJoint, RobotJoint, parameter_units
-from jaximp.models.kinematics import ArmGeometry
+from jaximp.models.kinematics import ArmGeometry, solve_pair
 
 __all__ = [
     "MOTION",
@@ -33,4 +33,5 @@ __all__ = [
     "mass_matrix",
     "parameter_units",
     "rigid_body_torque",
+    "solve_pair",
 ]

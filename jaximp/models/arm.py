@@ -25,6 +25,9 @@ from jaximp.models.base import Model
 from jaximp.models.joint import parameter_units, sine_and_cosine
 from jaximp.types import AnyArray
 
+LONGEST = 10.0
+"""No arm is longer [m]; a length beyond was given in other units."""
+
 
 class PlanarArm(Model):
     """Rigid body, damping and stiffness of an arm of two links: eqs. (9), (10), (13) of Lakatos et al. 2011.
@@ -76,8 +79,10 @@ class PlanarArm(Model):
     ):
         if zero not in ("horizontal", "hanging"):
             raise ValueError(f"zero is '{zero}': at zero the arm is 'horizontal' or 'hanging'")
-        if length is not None and not (inertia and gravity and np.isfinite(length) and length > 0):
-            raise ValueError(f"length is {length}: it must be above zero, and needs inertia and gravity, which it ties")
+        if length is not None and not (inertia and gravity and 0 < length < LONGEST):
+            raise ValueError(
+                f"length is {length}: it must be metres, above zero, and needs inertia and gravity, which it ties"
+            )
         if impedance and viscous:
             raise ValueError("damping_11 and damping_22 are viscous friction already: leave out viscous or impedance")
         self.equilibrium = _equilibrium(equilibrium, impedance)
@@ -264,7 +269,10 @@ def _equilibrium(equilibrium: Sequence[float] | AnyArray | None, impedance: bool
             "impedance needs the angles at which the elastic torque vanishes: pass equilibrium=(q1, q2) [rad], or "
             "impedance=False for the dynamics alone"
         )
-    return two_numbers("equilibrium", equilibrium)
+    angles = two_numbers("equilibrium", equilibrium)
+    if max(abs(angle) for angle in angles) > 2 * np.pi:
+        raise ValueError(f"equilibrium is {angles}: these are radians, and more than a turn; were degrees meant?")
+    return angles
 
 
 # What the columns are made of, by parameter. A column that only joint i feels is called as in `Joints`, so that those

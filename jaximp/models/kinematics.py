@@ -18,32 +18,49 @@ ROUNDING = 16
 """How many roundings beyond the reach, as a share of its square, still count as a straight or a folded arm."""
 
 
+def solve_pair(matrix: Num[AnyArray, "*N 2 2"], right: Num[AnyArray, "*N 2"]) -> Float[Array, "*N 2"]:
+    """`x` with `matrix @ x = right`, by Cramer's rule: no LAPACK in what runs by the thousand."""
+    (a, b), (c, d) = (matrix[..., 0, 0], matrix[..., 0, 1]), (matrix[..., 1, 0], matrix[..., 1, 1])
+    first, second = right[..., 0], right[..., 1]
+    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]
+
+
 class ArmGeometry(eqx.Module):
-    """Kinematics of an arm of two links, with the shoulder at the origin and the angles of `PlanarArm`.
+    """Kinematics of an arm of two links with the angles of `PlanarArm`.
 
-    `x = l1 cos q1 + l2 cos(q1 + q2)`, `y = l1 sin q1 + l2 sin(q1 + q2)`.
+    `x = l1 cos q1 + l2 cos(q1 + q2)`, `y = l1 sin q1 + l2 sin(q1 + q2)`, from the shoulder.
 
-    **Arguments:** `lengths` of upper arm and forearm [m]; `elbow` is the side of the line from shoulder to hand on
+    **Arguments:** `lengths` of upper arm and forearm [m]; `shoulder` where it is in the frame in which the hand is
+    measured [m], whose axes must be those of the angles; `elbow` is the side of the line from shoulder to hand on
     which the elbow lies, seen from the shoulder: `right` (`q2 >= 0`, a right arm seen from above) or `left`
     (`q2 <= 0`).
     """
 
     lengths: tuple[float, float]
     """Of upper arm and forearm [m]."""
+    shoulder: tuple[float, float]
+    """Position of the shoulder [m]."""
     elbow: str = eqx.field(static=True)
     """`right` (`q2 >= 0`) or `left` (`q2 <= 0`)."""
 
-    def __init__(self, lengths: Sequence[float] | Num[AnyArray, "2"], elbow: str = "right"):
+    def __init__(
+        self,
+        lengths: Sequence[float] | Num[AnyArray, "2"],
+        elbow: str = "right",
+        shoulder: Sequence[float] | Num[AnyArray, "2"] = (0.0, 0.0),
+    ):
         if elbow not in ("right", "left"):
             raise ValueError(f"elbow is '{elbow}': it must be 'right' or 'left' of the line from shoulder to hand")
         self.lengths = two_numbers("lengths", lengths, lowest=0.0, above=True)
+        self.shoulder = two_numbers("shoulder", shoulder)
         self.elbow = elbow
 
     def forward(self, q: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Position of the hand [m] at the angles `q` [rad]."""
         (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
         l1, l2 = self.lengths
-        return jnp.stack([l1 * cosine1 + l2 * cosine, l1 * sine1 + l2 * sine], axis=-1)
+        x, y = self.shoulder
+        return jnp.stack([x + l1 * cosine1 + l2 * cosine, y + l1 * sine1 + l2 * sine], axis=-1)
 
     def jacobian(self, q: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2 2"]:
         """`J` [m/rad] with `dx = J dq`; singular where the arm is straight or folded."""
@@ -74,6 +91,7 @@ class ArmGeometry(eqx.Module):
         **Source:** Börner et al. 2020, eqs. (21) and (22), with the quadrant of every angle.
         """
         x = jnp.asarray(x)
+        x = jnp.stack([x[..., k] - self.shoulder[k] for k in (0, 1)], axis=-1)
         l1, l2 = self.lengths
         squared = (x * x).sum(axis=-1)
         beyond, within = (l1 + l2) ** 2 - squared, squared - (l1 - l2) ** 2

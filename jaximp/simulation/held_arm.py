@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 
-from jaximp.models import ArmGeometry, mass_matrix, rigid_body_torque
+from jaximp.models import ArmGeometry, mass_matrix, rigid_body_torque, solve_pair
 from jaximp.trajectories import MinimumJerk, array_field
 from jaximp.types import AnyArray
 
@@ -98,8 +98,8 @@ def hold(
 
     A pure function: `vmap` over durations, arms and noise keys.
 
-    **Arguments:** `duration` of the movement [s], from the onset on; `time` [s] of the samples, the onset at zero;
-    `key` draws the noise, None leaves it out.
+    **Arguments:** `duration` of the movement [s], from the onset on; `time` [s] of the samples, evenly spaced, the
+    onset at zero and the beginning before it; `key` draws the noise, None leaves it out.
 
     **Source:** Lakatos et al. 2011, eqs. (9), (16), IV-B.
     """
@@ -114,7 +114,7 @@ def hold(
     else:
         q, dq, ddq = arm.posture + imposed[0], *imposed[1:]
         torque = rigid_body_torque(q, dq, ddq, jnp.asarray(arm.inertia)) + _muscles(arm, t, q, dq)
-        force = _hand_force(arm.geometry, q, torque)
+        force = solve_pair(arm.geometry.jacobian(q).swapaxes(-1, -2), torque)
     if key is not None:
         keys = jax.random.split(key)
         position += arm.position_noise * jax.random.normal(keys[0], position.shape)
@@ -140,10 +140,7 @@ def _acceleration(arm: HeldArm, t: Array, q: Array, dq: Array, torque: Array) ->
     """Of the joints under the torque of an outside force [rad/s^2]."""
     xi = jnp.asarray(arm.inertia)
     left = torque - _muscles(arm, t, q, dq) - rigid_body_torque(q, dq, jnp.zeros_like(dq), xi)
-    M = mass_matrix(q, xi)
-    (a, b), (c, d) = (M[..., 0, 0], M[..., 0, 1]), (M[..., 1, 0], M[..., 1, 1])
-    first, second = left[..., 0], left[..., 1]
-    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]
+    return solve_pair(mass_matrix(q, xi), left)
 
 
 def _cuff_force(arm: HeldArm, q: Array, dq: Array, robot: Array, robot_velocity: Array) -> Array:
@@ -182,11 +179,3 @@ def _through_the_cuff(arm: HeldArm, amplitudes: Array, duration: Array, t: Array
     rest = jnp.broadcast_to(jnp.asarray(arm.posture), amplitudes.shape)
     q, dq = jax.lax.scan(step, (rest, jnp.zeros_like(rest)), t)[1]
     return q.swapaxes(0, 1), dq.swapaxes(0, 1)
-
-
-def _hand_force(geometry: ArmGeometry, q: Array, torque: Array) -> Array:
-    """The force on the hand [N] that makes these torques, by Cramer's rule: no LAPACK in what runs by the thousand."""
-    J = geometry.jacobian(q)
-    (a, b), (c, d) = (J[..., 0, 0], J[..., 1, 0]), (J[..., 0, 1], J[..., 1, 1])
-    first, second = torque[..., 0], torque[..., 1]
-    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]

@@ -258,7 +258,7 @@ def shorter() -> dict[str, Any]:
     paper = np.asarray(noise_free_conditions(jnp.asarray(DURATIONS)))
     wanted = float(paper[np.abs(DURATIONS - reference).argmin()])
     designed = [
-        design_perturbations(ARM, subject.posture, observed, subject.inertia, way_points=WAY_POINTS, limits=limits)
+        design_perturbations(ARM, subject.posture, observed, subject.inertia, limits, way_points=WAY_POINTS)
         for observed in SHORTER
     ]
     conditions = np.array([one.condition for one in designed])
