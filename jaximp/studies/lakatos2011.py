@@ -438,7 +438,8 @@ WHY = (
     "Where the hand follows the robot exactly, the stiffness is positive definite and symmetric in every observation, "
     "for all noise and reflexes that were swept. The cuff that yields is this study's addition; the paper's model has "
     "none.",
-    "Quasi-symmetric means here: antisymmetric part at most 5 % of the symmetric one. Standard errors: at most 10 % of "
+    "Positive definite means here: by two standard errors of the smallest eigenvalue. "
+    "Quasi-symmetric: antisymmetric part at most 5 % of the symmetric one. Standard errors: at most 10 % of "
     "the matrix. Held-out torque: at least 90 % of its variance predicted. Quasi-constant: within 10 % of the estimate "
     "of the longest observation. Near the truth: within 10 % of the mean true stiffness of the observation. The paper "
     "does not say what it means by its words.",
