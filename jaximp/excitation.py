@@ -166,7 +166,7 @@ class Design:
         infinite where the window does not determine the parameters. Windows that reach back beyond the beginning of
         the period see the end of the one before.
         """
-        count = max(400, 4 * PER_CYCLE * np.shape(self.trajectory.sine)[-1])
+        count = FINER * max(200, PER_CYCLE * np.shape(self.trajectory.sine)[-1])
         motion = self.sampled(count / self.period)
         rows = self.model.observation_matrix(*(motion[name] for name in ("position", "velocity", "acceleration")))
         products = np.einsum("tni,tnj->tij", *[np.asarray(rows).reshape(count, self.model.n_joints, -1)] * 2)
