@@ -667,8 +667,8 @@ def _linear_limits(problem: _Problem) -> tuple[Array, Array]:
         return jnp.stack([q - series.offset, dq, ddq, jerk(series, t)])
 
     A = jax.jacobian(reached)(jnp.zeros(size)).reshape(-1, size)
-    room = jnp.stack([(problem.high - problem.low) / 2, *problem.most[:3]])
-    b = jnp.broadcast_to(room[:, None], (4, len(t), problem.n)).ravel()
+    half = jnp.stack([(problem.high - problem.low) / 2, *problem.most[:3]])
+    b = jnp.broadcast_to(half[:, None], (4, len(t), problem.n)).ravel()
     kept = np.isfinite(b)
     if not kept.any():
         raise ValueError("projected_gradient needs limits to project onto: give some, or use bfgs")

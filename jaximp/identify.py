@@ -85,6 +85,11 @@ class Estimates:
         theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
         return theta.mean(axis=0) if len(theta) else np.full(len(self.names), np.nan)
 
+    def sd_over_trusted(self) -> NDArray[np.float64]:
+        """(p,) standard deviation of each parameter over the trusted windows; NaN if there are none."""
+        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
+        return theta.std(axis=0) if len(theta) else np.full(len(self.names), np.nan)
+
 
 def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates]:
     """Run a job: one `Estimates` per method (a job without a robot beside the human has one).

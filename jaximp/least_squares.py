@@ -137,14 +137,15 @@ def variance_accounted_for(
     torque: Num[AnyArray, "S *n"], residual: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]
 ) -> Float[Array, ""]:
     """1 - var(residual)/var(torque) over the samples that count, means taken output by output; NaN without variance."""
+    total = scatter(torque, weight)
+    return jnp.where(total > 0, 1 - scatter(residual, weight) / jnp.where(total > 0, total, 1), jnp.nan)
 
-    def scatter(x: AnyArray) -> Array:
-        x, whole = jnp.where(weight > 0, x, 0), weight.sum(axis=0)
-        mean = (weight * x).sum(axis=0) / jnp.where(whole > 0, whole, 1)
-        return (weight * (x - mean) ** 2).sum()
 
-    total = scatter(torque)
-    return jnp.where(total > 0, 1 - scatter(residual) / jnp.where(total > 0, total, 1), jnp.nan)
+def scatter(x: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]) -> Float[Array, ""]:
+    """Weighted sum of squares about the mean, which is taken output by output."""
+    x, whole = jnp.where(weight > 0, x, 0), weight.sum(axis=0)
+    mean = (weight * x).sum(axis=0) / jnp.where(whole > 0, whole, 1)
+    return (weight * (x - mean) ** 2).sum()
 
 
 def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:

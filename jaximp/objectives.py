@@ -91,3 +91,10 @@ def log_stderr(gram: Float[Array, "*M p p"], parameter: int) -> Float[Array, "*M
     unit = jnp.zeros_like(lanes[0]).at[parameter].set(1)
     variance = engine.substitute(engine.cholesky(_bordered(lanes, unit)), p)[parameter]
     return 0.5 * jnp.log(variance).reshape(gram.shape[:-2])
+
+
+def solve_gram(gram: Float[Array, "p p"], right: Float[Array, "p k"]) -> Float[Array, "p k"]:
+    """`gram^-1 @ right` of one positive definite matrix, without LAPACK as above."""
+    p, k = right.shape
+    lanes = jnp.broadcast_to(gram[:, :, None], (p, p, k))
+    return jnp.stack(engine.substitute(engine.cholesky(_bordered(lanes, right)), p))

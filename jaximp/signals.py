@@ -258,10 +258,16 @@ def autocovariance(sos: Sections, every: int = 1, tolerance: float = 1e-9) -> ND
     filter: neighbouring residuals are no longer independent.
     """
     density = _zero_phase_gain(sos) ** 2
-    r = np.fft.irfft(density)[: len(density) // 2] / np.mean(np.r_[density, density[1:-1]])
+    r = np.fft.irfft(density)[: len(density) // 2] / kept_variance(sos)
     r = r[::every]
     beyond = np.flatnonzero(np.abs(r) > tolerance)
     return r[: beyond[-1] + 1]
+
+
+def kept_variance(sos: Sections) -> float:
+    """Share of the variance of white noise that the zero-phase filter leaves."""
+    density = _zero_phase_gain(sos) ** 2
+    return float(np.mean(np.r_[density, density[1:-1]]))
 
 
 def reach(sos: Sections, share: float = 0.01) -> int:

@@ -18,19 +18,19 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit, least_squares, variance_accounted_for
-from jaximp.models import ArmGeometry, PlanarArm
+from jaximp.models import ArmGeometry, PlanarArm, solve_pair
+from jaximp.objectives import solve_gram
 from jaximp.recordings import load_recording
 from jaximp.regression import design_filters, filtered
+from jaximp.signals import kept_variance
 from jaximp.types import AnyArray, Numbers, Recording
 
 STEADY = 0.005
-"""Before the onset, hands and forces drift by no more than such a share of what they do after it."""
+"""Before the onset the hand drifts by no more than such a share of what it moves after it."""
 NOISE = 6.0
 """A command has left its steady state where it differs from it by so many standard deviations of its own noise."""
 LEADING = 0.05
 """Share of a recording in which the command is steady for certain."""
-
-
 STRAIGHT = 0.05
 """Angle of the elbow [rad] below which an arm counts as straight."""
 FLAT = 0.05
@@ -69,17 +69,19 @@ class TrialRows(eqx.Module):
     """Displacement of the joints [rad] where each trial is farthest from its equilibrium."""
     jacobian: Float[Array, "T 2 2"]
     """See `Trials`."""
-    noise: Float[Array, " L"] | None
+    noise: Float[Array, " L"]
     """What the filters make of white noise of the torque: its autocovariance by lag, in rows."""
+    kept: float = eqx.field(static=True)
+    """Share of that noise's variance that the filters leave."""
+    baseline: int = eqx.field(static=True)
+    """Samples before the onset whose mean was taken off the torque."""
 
     def at_hand(self) -> TrialRows:
         """The same equations as forces on the hand: there the noise of both axes is alike, which that of the joints'
         torques is not. (The Jacobian is taken as constant during a trial.)"""
-        (a, c), (b, d) = self.jacobian[..., 0].T, self.jacobian[..., 1].T
-        inverse = jnp.stack([jnp.stack([d, -c], axis=-1), jnp.stack([-b, a], axis=-1)], axis=-2)
-        inverse = (inverse / (a * d - b * c)[:, None, None])[:, None]
-        W, torque = (inverse[..., None] * self.W[:, :, None]).sum(axis=3), (inverse * self.torque[:, :, None]).sum(-1)
-        return TrialRows(W, torque, self.time, self.peaks, self.jacobian, self.noise)
+        transposed = self.jacobian.swapaxes(-1, -2)[:, None]
+        W = solve_pair(transposed[:, :, None], self.W.swapaxes(-1, -2)).swapaxes(-1, -2)
+        return eqx.tree_at(lambda rows: (rows.W, rows.torque), self, (W, solve_pair(transposed, self.torque)))
 
 
 def joint_trials(
@@ -121,8 +123,7 @@ def read_trials(
 
     **Arguments:** `onset` of the perturbation [s] in each recording's own time; where it is not given it is found in
     the `reference` of the recording, the position or force that was commanded. `before` and `after` [s] are kept around
-    it; the mean of `before` is the steady state, and its error is not in the standard errors: at 0.2 s they are some 15
-    to 30 % too small for it.
+    it; the mean of `before` is the steady state.
 
     **Raises:** `ValueError` that names the trial, for one that has no onset, is too short around it, has gaps there, is
     no recording of a hand in a plane, or was sampled at another rate.
@@ -237,8 +238,11 @@ def regress_trials(model: PlanarArm, trials: Trials, settings: FilterSettings) -
     time = (jnp.arange(n)[:: filters.decimate] - trials.onset) / trials.sample_rate
     away = trials.angles - trials.equilibrium[:, None]
     farthest = jnp.argmax((away**2).sum(axis=-1), axis=1)
-    noise = None if filters.noise is None else jnp.asarray(filters.noise)
-    return TrialRows(W, torque, time, away[jnp.arange(len(away)), farthest], trials.jacobian, noise)
+    assert filters.parallel is not None
+    return TrialRows(
+        W, torque, time, away[jnp.arange(len(away)), farthest], trials.jacobian, jnp.asarray(filters.noise),
+        kept_variance(filters.parallel), trials.onset,
+    )  # fmt: skip
 
 
 def fit_trials(
@@ -250,10 +254,11 @@ def fit_trials(
     """One set of parameters from the first `observed` seconds after the onset of all trials, eq. (14).
 
     **Arguments:** `counts` (T,) False for trials that are held out. The noise is that of the force: `at_hand` weighs
-    the equations accordingly. Without it the joints' torques count alike, as in the paper, and standard errors are up
-    to 1.4 times too small or too large.
+    the equations accordingly. Without it the joints' torques count alike, as in the paper, and the standard errors are
+    those of noise that is alike in both joints, which it is not.
 
-    **Returns:** a `WindowFit`. At the hand its `cond`, `vaf` and `residual_rms` [N] are those of the hand's equations;
+    **Returns:** a `WindowFit` whose standard errors include that of the steady state, which all samples of a trial have
+    in common. At the hand its `cond`, `vaf` and `residual_rms` [N] are those of the hand's equations;
     the paper's condition number (19) is that without `at_hand`.
 
     **Raises:** `ValueError` for fewer rows than parameters, and for directions that do not span the plane.
@@ -270,8 +275,23 @@ def fit_trials(
         _check_directions(np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)])
     rows = rows.at_hand() if at_hand else rows
     shape = (T * N, n)
-    valid = jnp.broadcast_to(_observed(rows, observed, counts).reshape(-1, 1), shape)
-    return least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, rows.noise)
+    counted = _observed(rows, observed, counts)
+    valid = jnp.broadcast_to(counted.reshape(-1, 1), shape)
+    fit = least_squares(rows.W.reshape(*shape, p), rows.torque.reshape(shape), valid, rows.noise)
+    return _with_error_of_the_baseline(fit, rows, counted)
+
+
+def _with_error_of_the_baseline(fit: WindowFit, rows: TrialRows, counted: Array) -> WindowFit:
+    """White noise of variance s^2 leaves s^2 / baseline in the mean that was taken off each trial and axis; the
+    parameters inherit it through the sum of what each sample contributes to them."""
+    W = jnp.where(counted[..., None, None], rows.W, 0)
+    p = W.shape[-1]
+    passed_on = solve_gram(jnp.einsum("tnap,tnaq->pq", W, W), W.sum(axis=1).reshape(-1, p).T)
+    rows_left = fit.samples - p
+    white = fit.residual_rms**2 * fit.samples / jnp.where(rows_left > 0, rows_left, jnp.nan) / rows.kept
+    covariance = fit.covariance + white / rows.baseline * passed_on @ passed_on.T
+    stderr = jnp.sqrt(jnp.diagonal(covariance))
+    return eqx.tree_at(lambda fit: (fit.covariance, fit.stderr), fit, (covariance, stderr))
 
 
 def predict_trials(

@@ -85,12 +85,8 @@ class MatrixCriteria:
     asymmetry_stderr: Numbers
     """(M,)."""
 
-    def positive_definite(self) -> NDArray[np.bool_]:
-        """(M,) eq. (20)."""
-        return self.eigenvalues[:, 0] > 0
-
     def surely_definite(self, errors: float) -> NDArray[np.bool_]:
-        """(M,) positive definite by so many standard errors."""
+        """(M,) positive definite, eq. (20), by so many standard errors."""
         return self.eigenvalues[:, 0] > errors * self.eigenvalue_stderr[:, 0]
 
     def surely_indefinite(self, errors: float) -> NDArray[np.bool_]:
@@ -123,11 +119,7 @@ def matrix_criteria(
     if not set(elements) <= set(names):
         return None
     index = np.array([list(names).index(element) for element in elements])
-    values, errors = np.asarray(theta)[:, index], np.asarray(stderr)[:, index]
-    if covariance is None:
-        spread = errors[:, :, None] ** 2 * np.eye(4)
-    else:
-        spread = np.asarray(covariance)[:, index[:, None], index]
+    values, spread = np.asarray(theta)[:, index], _spread(stderr, covariance, index)
     symmetric = values.reshape(-1, 2, 2)
     symmetric = (symmetric + symmetric.swapaxes(1, 2)) / 2
     known = np.isfinite(symmetric).all(axis=(1, 2))
@@ -146,25 +138,37 @@ def matrix_criteria(
 
 
 def impossible_body(
-    names: Sequence[str], theta: Num[AnyArray, "M p"], stderr: Num[AnyArray, "M p"], errors: float
+    names: Sequence[str],
+    theta: Num[AnyArray, "M p"],
+    stderr: Num[AnyArray, "M p"],
+    errors: float,
+    covariance: Num[AnyArray, "M p p"] | None = None,
 ) -> NDArray[np.bool_]:
     """(M,) whether an arm's base inertial parameters belong to no rigid body, by so many standard errors.
 
     With `inertia_1 = I_1 + m_2 l1^2 + I_2`, `inertia_2 = m_2 c_2 l1`, `inertia_3 = I_2`: the last is above zero, so is
     the second (a forearm lies beyond the elbow), and `(inertia_1 - inertia_3) inertia_3 > inertia_2^2`, without which
-    the mass matrix is not positive definite.
+    the mass matrix is not positive definite. Without the `covariance` the errors are taken as independent.
     """
     wanted = [f"inertia_{k}" for k in (1, 2, 3)]
     if not set(wanted) <= set(names):
         return np.zeros(len(theta), bool)
-    index = [list(names).index(name) for name in wanted]
+    index = np.array([list(names).index(name) for name in wanted])
     (first, second, third), error = np.asarray(theta)[:, index].T, np.asarray(stderr)[:, index].T
+    spread = _spread(stderr, covariance, index)
     margin = (first - third) * third - second**2
-    slope = np.stack([third, -2 * second, first - 2 * third])
-    spread = np.sqrt(((slope * error) ** 2).sum(axis=0))
+    slope = np.stack([third, -2 * second, first - 2 * third], axis=1)
+    margin_error = np.sqrt(np.einsum("mi,mij,mj->m", slope, spread, slope))
     with np.errstate(invalid="ignore"):
-        found = np.stack([third / error[2], second / error[1], margin / spread])
+        found = np.stack([third / error[2], second / error[1], margin / margin_error])
         return np.asarray((found < -errors).any(axis=0))
+
+
+def _spread(stderr: AnyArray, covariance: AnyArray | None, index: NDArray[np.int64]) -> Numbers:
+    """(M, k, k) covariance of some parameters; of independent ones where it is not known."""
+    if covariance is not None:
+        return np.asarray(np.asarray(covariance)[:, index[:, None], index])
+    return np.asarray(stderr)[:, index, None] ** 2 * np.eye(len(index))
 
 
 @dataclass(frozen=True)
@@ -260,7 +264,7 @@ def confidence(
     cond, dof, vaf, unseen = (
         np.broadcast_to(np.asarray(x), len(theta)) for x in (fit.cond, fit.dof, fit.vaf, held_out_vaf)
     )
-    body = ~impossible_body(names, theta, stderr, limits.errors_apart)
+    body = ~impossible_body(names, theta, stderr, limits.errors_apart, covariance)
     return Confidence(cond, K, D, np.max(shares, axis=0), dof, body, vaf, unseen, limits)
 
 

@@ -27,7 +27,15 @@ from jaximp.chunks import (
     solve_traced,
 )
 from jaximp.compilation import compiled
-from jaximp.least_squares import Fit, SlidingFit, check_finite, root_of_weights, solve_window, variance_accounted_for
+from jaximp.least_squares import (
+    Fit,
+    SlidingFit,
+    check_finite,
+    root_of_weights,
+    scatter,
+    solve_window,
+    variance_accounted_for,
+)
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray
 
@@ -344,10 +352,7 @@ def _score_all(W: Array, y: Array, valid: Array, theta: Array, start: Array, win
         complete = (first + window <= len(W)) & (n >= 0.5 * window * math.prod(y.shape[1:]))
         vaf = jnp.where(complete, variance_accounted_for(torque, residual, weight), jnp.nan)
         rms = jnp.sqrt((residual**2).sum() / n)
-        torque = jnp.where(weight > 0, torque, 0)
-        mean = (weight * torque).sum(axis=0) / jnp.maximum(weight.sum(axis=0), 1)
-        variance = (weight * (torque - mean) ** 2).sum() / jnp.maximum(n, 1)
-        return Score(vaf, rms, n.astype(int), variance)
+        return Score(vaf, rms, n.astype(int), scatter(torque, weight) / jnp.maximum(n, 1))
 
     padded = _with_room((W, y, valid), room)
     return map_windows(one, (theta, start), room * math.prod(W.shape[1:]))

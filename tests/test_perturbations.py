@@ -9,8 +9,8 @@ import pytest
 from jaximp.excitation import Limits
 from jaximp.models import PlanarArm
 from jaximp.perturbations import condition_of, design_perturbations
-from jaximp.simulation.held_arm import DIRECTIONS, HeldArm
-from jaximp.studies.lakatos2011 import noise_free_conditions, paper_motions
+from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, imposed_motion
+from jaximp.studies.lakatos2011 import noise_free_conditions
 
 POSTURE = np.asarray(HeldArm().posture)
 INERTIA = np.asarray(HeldArm().inertia)
@@ -57,7 +57,7 @@ def test_designed_perturbations_keep_their_limits_and_are_better_conditioned() -
     np.testing.assert_allclose(away[:, 0], 0, atol=1e-15)
     np.testing.assert_allclose(dq[:, 0], 0, atol=1e-15)
     assert found.condition == pytest.approx(float(condition_of(ARM, POSTURE, (away, dq, ddq))), rel=0.02)
-    same_time = float(condition_of(ARM, POSTURE, paper_motions(0.23, t)))
+    same_time = float(condition_of(ARM, POSTURE, imposed_motion(DIRECTIONS, 0.23, t)))
     assert found.condition < 0.9 * same_time
     assert found.conditions[-1] < 1.05 * found.conditions[0]
 

@@ -121,9 +121,9 @@ def test_standard_errors_are_not_too_small(position_noise: float, least: float) 
         fit = fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
         return fit.theta, fit.stderr
 
-    theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), 40))
+    theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=8))(jax.random.split(jax.random.key(1), 150))
     spread, claimed = np.std(theta, axis=0, ddof=1), np.median(stderr, axis=0)
-    assert (spread < 1.3 * claimed).all()
+    assert (spread < 1.2 * claimed).all()
     assert (spread > least * claimed).all()
     np.testing.assert_allclose(np.mean(theta, axis=0), TRUTH, rtol=0.01)
 
@@ -241,7 +241,9 @@ def test_too_little_data_is_refused(held: HeldTrials) -> None:
     with pytest.raises(ValueError, match="directions of 1 trials"):
         fit_trials(both, 0.27, counts=np.array([True, False, False]))
     few = jax.tree.map(lambda x: x, both)
-    few = type(few)(few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks, few.jacobian, few.noise)
+    few = type(few)(
+        few.W[:, :1], few.torque[:, :1], few.time[:1], few.peaks, few.jacobian, few.noise, few.kept, few.baseline
+    )
     with pytest.raises(ValueError, match="cannot determine 11 parameters"):
         fit_trials(few, 0.27)
 

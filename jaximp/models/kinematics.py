@@ -18,7 +18,7 @@ ROUNDING = 16
 """How many roundings beyond the reach, as a share of its square, still count as a straight or a folded arm."""
 
 
-def solve_pair(matrix: Num[AnyArray, "*N 2 2"], right: Num[AnyArray, "*N 2"]) -> Float[Array, "*N 2"]:
+def solve_pair(matrix: Num[AnyArray, "*#N 2 2"], right: Num[AnyArray, "*#N 2"]) -> Float[Array, "*N 2"]:
     """`x` with `matrix @ x = right`, by Cramer's rule: no LAPACK in what runs by the thousand."""
     (a, b), (c, d) = (matrix[..., 0, 0], matrix[..., 0, 1]), (matrix[..., 1, 0], matrix[..., 1, 1])
     first, second = right[..., 0], right[..., 1]

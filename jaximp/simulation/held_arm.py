@@ -104,7 +104,7 @@ def hold(
     **Source:** Lakatos et al. 2011, eqs. (9), (16), IV-B.
     """
     t = jnp.asarray(time)
-    imposed = _imposed(jnp.asarray(amplitudes), jnp.asarray(duration, float), t)
+    imposed = imposed_motion(amplitudes, duration, t)
     position = arm.geometry.forward(arm.posture + imposed[0])
     if arm.yields:
         q, dq = _through_the_cuff(arm, jnp.asarray(amplitudes), jnp.asarray(duration, float), t)
@@ -122,10 +122,12 @@ def hold(
     return HeldTrials(t, position, force, q, dq, ddq, torque)
 
 
-def _imposed(amplitudes: Array, duration: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Displacement, velocity and acceleration (T, N, 2) of the joints if the hand follows the robot."""
-    profile = MinimumJerk(jnp.array([0.0, 1.0]), duration)(t)
-    away, dq, ddq = (jnp.multiply.outer(x, amplitudes).swapaxes(0, 1) for x in profile)
+def imposed_motion(
+    amplitudes: Num[AnyArray, "T 2"], duration: float | Num[AnyArray, ""], t: Num[AnyArray, " N"]
+) -> tuple[Array, Array, Array]:
+    """Displacement [rad], velocity and acceleration (T, N, 2) of the joints if the hand follows the robot: eq. (16)."""
+    profile = MinimumJerk(jnp.array([0.0, 1.0]), jnp.asarray(duration, float))(jnp.asarray(t))
+    away, dq, ddq = (jnp.multiply.outer(x, jnp.asarray(amplitudes)).swapaxes(0, 1) for x in profile)
     return away, dq, ddq
 
 
@@ -159,7 +161,7 @@ def _through_the_cuff(arm: HeldArm, amplitudes: Array, duration: Array, t: Array
 
     def rate(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         q, dq = state
-        away, velocity, _ = (x[:, 0] for x in _imposed(amplitudes, duration, t[None]))
+        away, velocity, _ = (x[:, 0] for x in imposed_motion(amplitudes, duration, t[None]))
         robot = arm.geometry.forward(arm.posture + away), arm.geometry.velocity(arm.posture + away, velocity)
         torque = arm.geometry.joint_torque(q, _cuff_force(arm, q, dq, *robot))
         return dq, _acceleration(arm, t, q, dq, torque)

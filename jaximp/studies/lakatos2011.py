@@ -25,7 +25,7 @@ from jaximp.job import FilterSettings
 from jaximp.models import PlanarArm, rigid_body_torque
 from jaximp.perturbations import condition_of, design_perturbations
 from jaximp.regression import design_filters
-from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold
+from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold, imposed_motion
 from jaximp.trajectories import MinimumJerk, SixthOrder, Trajectory, jerk
 from jaximp.trials import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence, matrix_criteria
@@ -228,13 +228,6 @@ def table_one(duration: float) -> dict[str, dict[str, Any]]:
     return found
 
 
-def paper_motions(duration: float | Array, t: Numbers) -> tuple[Array, Array, Array]:
-    """Displacement, velocity, acceleration (6, N, 2) of the paper's six perturbations, without a subject."""
-    profile = MinimumJerk(jnp.array([0.0, 1.0]), duration)(t)
-    away, dq, ddq = (jnp.multiply.outer(x, jnp.asarray(DIRECTIONS)).swapaxes(0, 1) for x in profile)
-    return away, dq, ddq
-
-
 @jax.jit
 def noise_free_conditions(durations: Array) -> Array:
     """Condition number (19) of the motion alone, over the observation sampled at 1 kHz."""
@@ -242,7 +235,7 @@ def noise_free_conditions(durations: Array) -> Array:
 
     def one(duration: Array) -> Array:
         inside = t < duration + OBSERVED + 0.5 / RATE
-        return condition_of(ARM, HeldArm().posture, paper_motions(duration, t), inside)
+        return condition_of(ARM, HeldArm().posture, imposed_motion(DIRECTIONS, duration, t), inside)
 
     return jax.lax.map(one, durations)
 
@@ -252,7 +245,7 @@ def shorter() -> dict[str, Any]:
     subject = HeldArm()
     reference = 0.3
     t = np.linspace(0, reference, 301)
-    away, dq, ddq = paper_motions(reference, t)
+    away, dq, ddq = imposed_motion(DIRECTIONS, reference, t)
     torque = rigid_body_torque(subject.posture + away, dq, ddq, jnp.asarray(subject.inertia))
     limits = Limits((-0.05, 0.05), float(jnp.abs(dq).max()), torque=float(jnp.abs(torque).max()))
     paper = np.asarray(noise_free_conditions(jnp.asarray(DURATIONS)))
