@@ -63,6 +63,13 @@ def filter_zero_phase(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "
     return _filter_from_rest(sos, y, backward=True)[edge:-edge]
 
 
+def filter_from_zero(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "N *k"]:
+    """Run the sections forward over axis 0, as if all had been zero before: `scipy.signal.sosfilt(sos, x, axis=0)`."""
+    require_float64(x)
+    x, sections = _floating(x), jnp.asarray(sos)
+    return _filter(sections, jnp.zeros((len(sections), 2), x.dtype), x, backward=False)
+
+
 def _floating(x: AnyArray) -> Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)

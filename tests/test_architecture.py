@@ -32,7 +32,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("least_squares", "objectives"),
     ("engine",),
     ("simulation", "bounds"),
-    ("models",),
+    ("models", "movements"),
     ("recordings", "trajectories"),
     ("signals", "readers", "settings", "optimise"),
     ("outputs", "types", "compilation"),

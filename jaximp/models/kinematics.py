@@ -74,6 +74,33 @@ class ArmGeometry(eqx.Module):
         """Velocity of the hand [m/s] at the angles `q` [rad] and velocities `dq` [rad/s] of the joints."""
         return (self.jacobian(q) * jnp.asarray(dq)[..., None, :]).sum(axis=-1)
 
+    def hand_motion(
+        self, q: Num[ArrayLike, "... 2"], dq: Num[ArrayLike, "... 2"], ddq: Num[ArrayLike, "... 2"]
+    ) -> tuple[Float[Array, "... 2"], Float[Array, "... 2"], Float[Array, "... 2"]]:
+        """Position of the hand [m], velocity and acceleration from those of the joints [rad]."""
+        turned = self.velocity(q, ddq)
+        return self.forward(q), self.velocity(q, dq), turned - self._centripetal(q, dq)
+
+    def joint_motion(
+        self, x: Num[ArrayLike, "... 2"], v: Num[ArrayLike, "... 2"], a: Num[ArrayLike, "... 2"]
+    ) -> tuple[Float[Array, "... 2"], Float[Array, "... 2"], Float[Array, "... 2"]]:
+        """Angles [rad], velocities and accelerations of the joints from those of the hand [m].
+
+        **Raises:** as `inverse`.
+        """
+        q = self.inverse(x)
+        J = self.jacobian(q)
+        dq = solve_pair(J, jnp.asarray(v))
+        return q, dq, solve_pair(J, jnp.asarray(a) + self._centripetal(q, dq))
+
+    def _centripetal(self, q: ArrayLike, dq: ArrayLike) -> Array:
+        """Acceleration of the hand towards the joints [m/s^2], at constant velocities of the joints: `-dJ/dt dq`."""
+        (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
+        first = jnp.asarray(dq)[..., 0]
+        upper = self.lengths[0] * first**2
+        fore = self.lengths[1] * (first + jnp.asarray(dq)[..., 1]) ** 2
+        return jnp.stack([upper * cosine1 + fore * cosine, upper * sine1 + fore * sine], axis=-1)
+
     def joint_torque(self, q: Num[ArrayLike, "... 2"], force: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Torques of the joints [N m] that a force on the hand [N] makes, `J' force`: Börner et al. 2020, eq. (23)."""
         return (self.jacobian(q) * jnp.asarray(force)[..., :, None]).sum(axis=-2)
