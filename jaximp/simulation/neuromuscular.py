@@ -277,21 +277,32 @@ def _acceleration(
     error = drive.q - q + arm.damping_time * (drive.dq - dq)
     torque, activation = _muscle_torque(arm, planned, drive.noise, error)
 
+    return accelerate(arm, q, dq, torque, command), activation
+
+
+def accelerate(
+    arm: NeuromuscularArm,
+    q: Float[Array, "2 *T"],
+    dq: Float[Array, "2 *T"],
+    torque: Float[Array, "2 *T"],
+    command: Float[Array, "2 *T"],
+) -> Float[Array, "2 *T"]:
+    """Acceleration of the joints [rad/s^2] of arm and handle under the muscles' torque [N m] and a command [N]."""
     angles, rates, handle = jnp.moveaxis(q, 0, -1), jnp.moveaxis(dq, 0, -1), arm.handle
     J, M = arm.geometry.jacobian(angles), mass_matrix(angles, arm.xi)
     C = coriolis_matrix(angles, rates, arm.xi)
-    _, v, a = arm.geometry.hand_motion(angles, rates, jnp.zeros_like(rates))
-    outside = handle.force(jnp.moveaxis(command, 0, -1), v, a)
+    _, v, centripetal = arm.geometry.hand_motion(angles, rates, jnp.zeros_like(rates))
+    outside = handle.force(jnp.moveaxis(command, 0, -1), v, centripetal)
+    carried = handle.mass + handle.own_mass  # the handle moves with the hand
     # Sums of two written out, as a reduction over so short an axis costs more than all the rest.
     left = [
         torque[i] - sum(C[..., i, j] * dq[j] for j in (0, 1)) + sum(J[..., k, i] * outside[..., k] for k in (0, 1))
         for i in (0, 1)
     ]
-    carried = handle.mass + handle.own_mass  # the handle moves with the hand
     (a, b), (_, d) = (
         [M[..., i, j] + sum(carried[k] * J[..., k, i] * J[..., k, j] for k in (0, 1)) for j in (0, 1)] for i in (0, 1)
     )
-    return jnp.stack([d * left[0] - b * left[1], a * left[1] - b * left[0]]) / (a * d - b * b), activation
+    return jnp.stack([d * left[0] - b * left[1], a * left[1] - b * left[0]]) / (a * d - b * b)
 
 
 class Reaches(eqx.Module):
