@@ -75,6 +75,7 @@ class Isolated(eqx.Module):
     """(2,) cut-off frequencies of the high-pass [Hz], where there was one."""
 
 
+@eqx.filter_jit
 def in_window(movements: Movements, samples: int) -> Movements:
     """The `samples` from each onset on, of which it is the first."""
 
@@ -88,6 +89,7 @@ def in_window(movements: Movements, samples: int) -> Movements:
     return Movements(x, v, a, force, command, jnp.zeros_like(movements.onset), movements.sample_rate)
 
 
+@jax.jit
 def jerk(movements: Movements) -> Float[Array, "T N 2"]:
     """Derivative of the acceleration [m/s^3] by central differences."""
     return jax.vmap(lambda a: central_differences(a, movements.sample_rate)[0])(movements.acceleration)

@@ -172,14 +172,18 @@ class Panel:
 
 
 @styled
-def curves(panels: Sequence[Panel]) -> Figure:
-    """Panels one below another, each with its legend beside it."""
-    figure = Figure(figsize=(WIDTH, 2.2 * len(panels) + 0.3))
-    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
-    for axis, panel in zip(axes, panels, strict=True):
-        for k, (label, x, y) in enumerate(panel.lines):
-            color, style = (BLACK, "-") if k == 0 else LINES[:4][(k - 1) % 4]
-            draw_line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if k else 1.3)
+def curves(panels: Sequence[Panel], columns: int = 1) -> Figure:
+    """Panels row by row, each with its legend beside it; in several columns one legend, beside the last of them."""
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(WIDTH, 2.2 * rows + 0.3))
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[len(panels) :]:
+        axis.remove()
+    for k, (axis, panel) in enumerate(zip(axes[: len(panels)], panels, strict=True)):
+        beside = (k + 1) % columns == 0
+        for i, (label, x, y) in enumerate(panel.lines):
+            color, style = (BLACK, "-") if i == 0 else LINES[:4][(i - 1) % 4]
+            draw_line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if i else 1.3)
             if label in panel.bands:
                 draw_band(axis, x, *panel.bands[label], color=color, alpha=0.2, linewidth=0)
         if panel.limits is not None:
@@ -187,5 +191,6 @@ def curves(panels: Sequence[Panel]) -> Figure:
         if panel.log:
             axis.set_yscale("log")
         axis.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
-        axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+        if beside:
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

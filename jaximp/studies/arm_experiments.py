@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Num, PRNGKeyArray
 from numpy.typing import NDArray
 
 from jaximp.isolation import VOLUNTARY_DELAY, Deviations, in_window
-from jaximp.models import ArmLinks, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
+from jaximp.models import ArmLinks, borner_from_lakatos, rigid_body_torque
 from jaximp.movements import Movements
 from jaximp.simulation.neuromuscular import (
     ANGLES,
@@ -29,6 +29,7 @@ from jaximp.simulation.neuromuscular import (
 )
 from jaximp.types import AnyArray, Numbers
 
+QUANTITIES = ("position", "velocity", "acceleration", "force")
 GROUP = 20
 """Trials that one estimate is made of."""
 LINKS = ArmLinks((0.29, 0.34), (1.93, 1.52), (0.165, 0.19), (0.0141, 0.0188))
@@ -44,7 +45,7 @@ class Case(NamedTuple):
     """T_mov [s]."""
     cutoff: float = 2.0
     """Of the neural noise, f_c,N [Hz]."""
-    amplitude: float = 12.5
+    amplitude: Any = 12.5
     """Of the neural noise, alpha_N."""
 
 
@@ -57,23 +58,36 @@ class Experiment(eqx.Module):
     """The same trials without the perturbation."""
     unperturbed: Movements | None
     """Other trials of the same task, as an experiment has them."""
-    postures: Movements
-    """100 trials of the static task."""
-    stiffness: Float[Array, "T 3"]
+    postures: Movements | None
+    """100 trials of the static task, where it was done."""
+    stiffness: Float[Array, "*S T 3"]
     """True K11, K12, K22 [N m/rad], mean over the window of each trial, without the perturbation."""
 
 
 def run_case(
-    arm: NeuromuscularArm, case: Case, keys: PRNGKeyArray, others: int = 0, window: float = VOLUNTARY_DELAY
+    arm: NeuromuscularArm,
+    case: Case,
+    keys: Array,
+    static: bool = True,
+    others: int = 0,
+    window: float = VOLUNTARY_DELAY,
 ) -> Iterator[Experiment]:
-    """One experiment for each key; all of them are simulated in one call."""
-    found = _simulate(arm, Reach(duration=case.duration), case, keys, others, window)
+    """One experiment for each key; all of them are simulated in one call.
+
+    **Arguments:** `static` says whether the static task is done as well; `others` is the number of unperturbed trials
+    beside the twins; `window` [s] in which the true stiffness is averaged.
+    """
+    # As an array: amplitudes share their compiled code.
+    case = case._replace(amplitude=jnp.asarray(case.amplitude))
+    found = _simulate(arm, Reach(duration=case.duration), case, keys, static, others, window)
     for k in range(len(keys)):
         yield jax.tree.map(lambda x, k=k: x[k], found)
 
 
 @eqx.filter_jit
-def _simulate(arm: NeuromuscularArm, task: Reach, case: Case, keys: Array, others: int, window: float) -> Experiment:
+def _simulate(
+    arm: NeuromuscularArm, task: Reach, case: Case, keys: Array, static: bool, others: int, window: float
+) -> Experiment:
     samples, S = round(case.duration * RATE) + 1, len(keys)
     parts = jax.vmap(lambda key: jax.random.split(key, 4))(keys)
     noise_of = lambda key, trials: neural_noise(key, trials, samples, case.amplitude, case.cutoff)  # noqa: E731
@@ -93,13 +107,14 @@ def _simulate(arm: NeuromuscularArm, task: Reach, case: Case, keys: Array, other
         more = jax.vmap(lambda key: noise_of(key, others))(parts[:, 2])
         unperturbed, _ = trials(jnp.zeros((S, others, 2)), more)
 
-    def static(key: PRNGKeyArray) -> Movements:
+    def hold(key: PRNGKeyArray) -> Movements:
         held = neural_noise(key, 100, round(1.5 * RATE), case.amplitude, case.cutoff)
         return hold_posture(arm, np.repeat(POSTURES, 20, axis=0), np.tile(ANGLES, 5), held)
 
     inside = round(window * RATE) + 1
     cut = jax.vmap(jax.vmap(lambda K, first: jax.lax.dynamic_slice_in_dim(K, first, inside).mean(axis=0)))
-    return Experiment(perturbed, twins, unperturbed, jax.vmap(static)(parts[:, 3]), cut(stiffness, twins.onset))
+    postures = jax.vmap(hold)(parts[:, 3]) if static else None
+    return Experiment(perturbed, twins, unperturbed, postures, cut(stiffness, twins.onset))
 
 
 def true_deviations(experiment: Experiment, window: float = VOLUNTARY_DELAY) -> Deviations:
@@ -112,6 +127,16 @@ def true_deviations(experiment: Experiment, window: float = VOLUNTARY_DELAY) -> 
         without.acceleration - with_it.acceleration,
         without.force - with_it.force,
     )
+
+
+def normalised_errors(true: Deviations, found: Deviations) -> Numbers:
+    """(4, T, S) root mean squares over both axes [%], each divided by the largest true value of its trial: eq. (42)."""
+
+    def one(true: Numbers, found: Numbers) -> Numbers:
+        share = (true - found) / np.abs(true).max(axis=1, keepdims=True)
+        return 100 * np.sqrt((share**2).mean(axis=-1))
+
+    return np.stack([one(*(np.asarray(getattr(x, name)) for x in (true, found))) for name in QUANTITIES])
 
 
 def as_matrix(K: Num[AnyArray, "*N 3"]) -> Numbers:
@@ -129,21 +154,20 @@ def replayed_torque(
     arm: NeuromuscularArm,
     unperturbed: Movements,
     command: Num[AnyArray, "T S 2"],
-    inertia: Num[AnyArray, "T 3"],
+    inertia: Num[AnyArray, "3"],
     D: Num[AnyArray, "T 2 2"],
     K: Num[AnyArray, "T 2 2"],
 ) -> Float[Array, "T S 2"]:
     """Deviation of the external torque [N m] of an arm with other inertia and impedance, pushed alike: Table 2B.
 
     **Arguments:** `unperturbed` trials, cut to the window, from which the muscles deviate by D and K alone; `command`
-    the perturbing force [N] in the window; `inertia` of eq. (12) [kg m^2], D and K, one for each trial.
+    the perturbing force [N] in the window; `inertia` of eq. (12) [kg m^2]; D and K one for each trial.
     """
     geometry = arm.geometry
     q, dq, ddq = geometry.joint_motion(unperturbed.position, unperturbed.velocity, unperturbed.acceleration)
-    xi = lakatos_from_borner(jnp.asarray(inertia))
+    other = eqx.tree_at(lambda arm: arm.inertia, arm, jnp.asarray(inertia))
     outside = geometry.joint_torque(q, unperturbed.force)
-    intended = jax.vmap(rigid_body_torque)(q, dq, ddq, xi) - outside
-    other = eqx.tree_at(lambda arm: arm.inertia, arm, jnp.asarray(inertia).T)
+    intended = rigid_body_torque(q, dq, ddq, other.xi) - outside
     D, K = jnp.moveaxis(jnp.asarray(D), 0, -1), jnp.moveaxis(jnp.asarray(K), 0, -1)
     # Time first, trials last, as the simulator has them.
     plan = tuple(jnp.moveaxis(x, (1, 2, 0), (0, 1, 2)) for x in (q, dq, intended, jnp.asarray(command)))
