@@ -31,7 +31,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("chunks",),
     ("least_squares", "objectives"),
     ("engine",),
-    ("simulation", "bounds"),
+    ("simulation", "bounds", "movement_trials"),
     ("models", "movements"),
     ("recordings", "trajectories"),
     ("signals", "readers", "settings", "optimise"),
