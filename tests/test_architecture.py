@@ -23,7 +23,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("regression",),
     ("design",),
     ("job",),
-    ("design_files",),
+    ("design_files", "trial_settings"),
     ("excitation",),
     ("payload",),
     ("trust",),
