@@ -33,6 +33,7 @@ __all__ = [
     "recording_from_arrays",
     "recording_from_mapping",
     "save_recording",
+    "save_trial_table",
 ]
 
 Entry = str | Sequence[str] | Mapping[str, Any]
@@ -261,19 +262,37 @@ def save_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
 
     **Raises:** `ValueError` for another extension.
     """
+    _write_columns(_named_columns(recording), Path(path))
+
+
+def save_trial_table(recordings: Sequence[Recording], path: str | os.PathLike[str]) -> None:
+    """Write trials below one another into one CSV or Parquet file, which `load_trial_table` reads back equal.
+
+    Columns as in `save_recording`, and `trial`, which counts from 1.
+
+    **Raises:** `ValueError` for another extension, for no trials, and for channels that only some trials have.
+    """
+    tables = [_named_columns(recording) for recording in recordings]
+    if not tables or any(list(table) != list(tables[0]) for table in tables):
+        raise RecordingError(f"{path}: the trials must be at least one, and have the same channels: complete them")
+    columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+    numbers = np.repeat(np.arange(1, len(tables) + 1), [len(recording) for recording in recordings])
+    _write_columns({"trial": numbers, **columns}, Path(path))
+
+
+def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """A table that appears whole or not at all."""
     import pyarrow
     import pyarrow.csv
     import pyarrow.parquet
 
-    path = Path(path)
     writers = {".csv": pyarrow.csv.write_csv, ".parquet": pyarrow.parquet.write_table}
     if path.suffix.lower() not in writers:
         raise RecordingError(f"{path}: cannot write '{path.suffix}' files; use one of: {', '.join(writers)}")
-    table = pyarrow.table(_named_columns(recording))
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
     try:
         with unfinished.open("wb") as file:
-            writers[path.suffix.lower()](table, file)
+            writers[path.suffix.lower()](pyarrow.table(dict(columns)), file)
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
