@@ -530,7 +530,9 @@ def _check_shapes(clock: _Signal, signals: dict[str, _Signal], n: int) -> None:
     for channel, signal in signals.items():
         if len(signal.labels) != n and channel != "force":
             raise RecordingError(f"{channel} has {len(signal.labels)} columns for {n} joints; give one per joint")
-    _check_lengths([(signal.labels[0], signal.values) for signal in (clock, *signals.values())])
+    # A clock that was made of a rate is as long as the position, which is then to be named.
+    compared = [*signals.values(), clock] if clock.labels == ("sample_rate",) else [clock, *signals.values()]
+    _check_lengths([(signal.labels[0], signal.values) for signal in compared])
     if len(clock.values) < 3:
         raise RecordingError(
             f"has {len(clock.values)} samples; at least 3 are needed, and a useful fit needs many more"

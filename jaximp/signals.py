@@ -239,9 +239,11 @@ def central_differences(
 
 
 def savitzky_golay_half_length(sample_rate: float, cutoff: float = 50.0, order: int = 7) -> int:
-    """Half length M of the Savitzky-Golay filter (2 M + 1 samples) whose amplitude is down by 3 dB at `cutoff` [Hz].
+    """Half length M of the Savitzky-Golay filter (2 M + 1 samples) with this `cutoff` [Hz].
 
-    From `f_c = (n + 1) / (3.2 M - 4.6)`, with the order n of the polynomial and f_c in halves of the sample rate.
+    From `f_c = (n + 1) / (3.2 M - 4.6)`, with the order n of the polynomial and f_c in halves of the sample rate. With
+    order 7 and 50 Hz, the velocity is down by 3 dB at 50 Hz, the position at 46 Hz (its order is in fact 6: odd powers
+    vanish in the middle), and the acceleration at 41 Hz.
 
     **Raises:** `ValueError` for a cut-off that would take no more samples than the polynomial has coefficients.
 

@@ -136,6 +136,8 @@ def as_recordings(
 ) -> list[Recording]:
     """What sensors record, every n-th sample from the first on: position [m], force [N], and the perturbing force [N]
     as `command`, or in the static task the handle's position [m] as `reference`."""
+    if not 0 <= sensors.force_noise < np.inf:
+        raise ValueError(f"the force's noise of {sensors.force_noise:g} N: it must be zero or more")
     rng = np.random.default_rng(seed)
     part = (slice(None), slice(first, None, every))
     position, force, command = (np.asarray(x)[part] for x in (movements.position, movements.force, movements.command))
@@ -180,12 +182,9 @@ def write_arm_recordings(
     static = as_recordings(held, sensors, seed + 1, settled, static=True)
     save_trial_table(static, folder / f"postures.{format}")
     progress(0.9)
-    values = {"format": format, "window": WINDOW} | {
-        name: np.asarray(x).tolist()
-        for name, x in (
-            ("lengths", arm.lengths), ("inertia", arm.inertia), ("mass", arm.handle.mass), ("damping", arm.handle.damping)
-        )
-    }  # fmt: skip
+    numbers = {"lengths": arm.lengths, "inertia": arm.inertia, "mass": arm.handle.mass, "damping": arm.handle.damping}
+    lists = {name: np.asarray(x).tolist() for name, x in numbers.items()}
+    values: dict[str, object] = {"format": format, "window": WINDOW, **lists}
     for name, text in (("job.toml", MOVEMENT), ("posture.toml", POSTURE)):
         (folder / name).write_text(text.format(**values), encoding="utf-8")
     truth = json.dumps(true_values(arm, moved, seed), indent=1) + "\n"
