@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from scipy.signal import savgol_filter
@@ -198,7 +199,8 @@ def test_trial_table_names_its_trial(tmp_path: Path) -> None:
 
 
 def test_postures_are_read() -> None:
-    truth = hold_posture(NeuromuscularArm(), POSTURES[:3], ANGLES[[0, 5, 9]], np.zeros((3, 6000, 6)), onset=0.5)
+    noise = np.zeros((3, 6000, 6))
+    truth = jax.jit(lambda: hold_posture(NeuromuscularArm(), POSTURES[:3], ANGLES[[0, 5, 9]], noise, onset=0.5))()
     postures, _ = read_postures(as_recordings(truth, EXACT, static=True), geometry=ArmGeometry((0.29, 0.34)))
     first, n = int(postures.onset[0]), postures.position.shape[1]
     start = 2000 - 2 * first
