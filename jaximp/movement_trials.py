@@ -256,14 +256,20 @@ def find_onset(name: str, recording: Recording) -> int:
 
 def _onset_of(command: Numbers, least: float = 0.0) -> int | None:
     """Where a command (N, n) begins to differ from its beginning, by more than its noise and `least`; None: nowhere."""
-    leading = command[: max(10, round(LEADING * len(command)))]
-    away = np.abs(command - np.nanmean(leading, axis=0)).max(axis=1)
-    left = away > max(NOISE * float(np.nanstd(leading, axis=0).max()), 1e-9 * float(np.nanmax(away)))
+    leading = _leading(command)
+    away = np.abs(command - leading.mean(axis=0)).max(axis=1)
+    left = away > max(NOISE * float(leading.std(axis=0).max()), 1e-9 * float(np.nanmax(away)))
     # One sample beyond may be a spike: the command stays away for a while.
     left = left & np.append(left[1:], False) & np.append(left[2:], [False, False])
     if not left.any() or not np.nanmax(away) > least:
         return None
     return max(0, int(np.argmax(left)) - 1)
+
+
+def _leading(command: Numbers) -> Numbers:
+    """What was measured of a command first, while it is steady for certain."""
+    measured = command[np.isfinite(command).all(axis=1)]
+    return measured[: max(10, round(LEADING * len(command)))]
 
 
 def _onsets(
@@ -303,8 +309,7 @@ def _sample(recording: Recording, at: float) -> int:
 
 def _check_beginning(name: str, command: Numbers, largest: float) -> None:
     """A command that has begun when the recording does would pass for its own steady state."""
-    leading = command[: max(10, round(LEADING * len(command)))]
-    if np.nanmax(np.abs(leading - np.nanmedian(command, axis=0))) > 0.1 * largest > 0:
+    if np.abs(_leading(command) - np.nanmedian(command, axis=0)).max() > 0.1 * largest > 0:
         raise ValueError(
             f"{name}: its command is not at rest when the recording begins; record at least {BEFORE:g} s before the "
             "onset, or leave it out"

@@ -347,6 +347,15 @@ def test_a_gap_elsewhere_shortens_all_trials(arranged: list[Recording]) -> None:
     np.testing.assert_allclose(shorter.position, whole.position[:, :n], atol=1e-12)
 
 
+def test_gaps_at_the_beginning_do_not_matter(arranged: list[Recording]) -> None:
+    def lose(r: Recording) -> Recording:
+        begun = np.arange(len(r))[:, None] >= 200
+        return replace(with_gap(r, slice(200)), command=np.where(begun, r.command, np.nan))
+
+    perturbed, unperturbed, _ = read_movements(at(1, lose)(arranged))
+    assert (len(perturbed), len(unperturbed or [])) == (6, 4)
+
+
 def test_what_is_missing_is_said(arranged: list[Recording]) -> None:
     perturbed, unperturbed, notes = read_movements(arranged[:6], window=0.2)
     assert unperturbed is None
