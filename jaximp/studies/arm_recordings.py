@@ -1,7 +1,7 @@
 """Recordings of the simulated arm of Börner et al. 2020, with the job that reads them: `simulate arm`.
 
 They are sampled at 2 kHz, every second sample of the simulation: half the file (6 MB in place of 13), and little is
-lost. Of what the perturbations make in the window, velocities that are read back are wrong by 0.73 % in place of 0.68 %,
+lost. Of what the perturbations make in the window, velocities that are read are wrong by 0.73 % in place of 0.68 %,
 and accelerations by 4.4 % in place of 4.2 %, nearly all of which the smoothing takes off the force as well.
 """
 
