@@ -5,8 +5,16 @@ from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.identify import Estimates, identify, identify_recording
 from jaximp.job import FilterSettings, Job, parse_job, read_job
 from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
+from jaximp.movement_trials import judge_sensors, read_movements, read_postures
+from jaximp.movements import Handle, Movements
 from jaximp.perturbations import Perturbations, design_perturbations
-from jaximp.recordings import load_recording, recording_from_arrays, save_recording
+from jaximp.recordings import (
+    load_recording,
+    load_trial_table,
+    recording_from_arrays,
+    save_recording,
+    save_trial_table,
+)
 from jaximp.recursive import RecursiveFit, recursive_least_squares
 from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 from jaximp.trials import fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
@@ -20,9 +28,11 @@ __all__ = [
     "Estimates",
     "FilterSettings",
     "FourierSeries",
+    "Handle",
     "Job",
     "Limits",
     "MinimumJerk",
+    "Movements",
     "Perturbations",
     "RaisedSine",
     "Recording",
@@ -42,18 +52,23 @@ __all__ = [
     "identify_recording",
     "jerk",
     "joint_trials",
+    "judge_sensors",
     "least_squares",
     "load_recording",
+    "load_trial_table",
     "load_trials",
     "models",
     "parse_job",
     "predict_trials",
     "read_job",
+    "read_movements",
+    "read_postures",
     "read_trials",
     "recording_from_arrays",
     "recursive_least_squares",
     "regress_trials",
     "save_recording",
+    "save_trial_table",
     "sliding_least_squares",
     "sliding_pieces",
     "sliding_theta",

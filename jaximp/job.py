@@ -18,6 +18,7 @@ from jaximp.payload import METHODS
 from jaximp.recordings import recording_from_mapping
 from jaximp.settings import check_keys, checked, optional, read, settings
 from jaximp.trajectories import FourierSeries
+from jaximp.trial_settings import HandArmSettings, TrialsSettings, arm_settings, trials_settings
 from jaximp.trust import TrustLimits
 from jaximp.types import Recording
 
@@ -113,6 +114,8 @@ class ModelSettings:
     human: HumanSettings | None = None
     robot: RobotSettings | None = None
     arm: ArmSettings | None = None
+    hand_arm: HandArmSettings | None = None
+    """`[model.arm]` of a job with `[trials]`."""
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
 
@@ -135,11 +138,18 @@ class Job:
     """The trajectory.json of the design that the motion followed: it serves in place of both."""
     folder: Path = Path()
     """Where relative file names start."""
+    trials: TrialsSettings | None = None
+    """In place of a recording: perturbation trials of an arm."""
     text: str = ""
     """The job file as written."""
 
     def load(self) -> Recording:
-        """The recording to be identified."""
+        """The recording to be identified.
+
+        **Raises:** `ValueError` for a job with trials, which `trials.load` reads, and as `load_recording`.
+        """
+        if self.trials is not None:
+            raise ValueError("this job has [trials] and no [recording]: read them by its trials.load()")
         return recording_from_mapping(self.recording, self.folder)
 
     def load_robot_alone(self) -> Recording | None:
@@ -154,7 +164,8 @@ class Job:
         """What the job reads."""
         tables = (self.recording, self.robot_recording or {})
         names = [str(table["file"]) for table in tables if "file" in table]
-        return [self.folder / name for name in (*names, self.design) if name is not None]
+        trials = [] if self.trials is None else self.trials.paths()
+        return [*(self.folder / name for name in (*names, self.design) if name is not None), *trials]
 
     def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
@@ -188,7 +199,9 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
     known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period", "design"]
-    check_keys(tables, known, "the job")
+    check_keys(tables, [*known, "trials"], "the job")
+    if "trials" in tables:
+        return _job_of_trials(tables, folder, text)
     for required in ("recording", "model", "window"):
         if required not in tables:
             raise ValueError(f"the job has no [{required}] table: add one")
@@ -211,6 +224,25 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     return job
 
 
+def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
+    """A job whose trials stand in place of a recording, its filters and its windows."""
+    for other in tables:
+        if other not in ("trials", "model", "trust"):
+            raise ValueError(
+                f"[trials] stand in place of a recording and have a window of their own: leave out '{other}'"
+            )
+    model = tables.get("model", {})
+    if not isinstance(model, dict) or "arm" not in model:
+        raise ValueError("[trials] are those of an arm: add [model.arm] with its lengths")
+    check_keys(model, ["arm"], "[model] beside [trials]")
+    arm = arm_settings(model["arm"])
+    trials = trials_settings(tables["trials"], folder, arm.geometry())
+    trust = settings(TrustLimits, tables.get("trust", {}), "trust")
+    _check_limits(trust)
+    window = WindowSettings(trials.window)
+    return Job({}, ModelSettings(hand_arm=arm), window, trust=trust, trials=trials, folder=folder, text=text)
+
+
 def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
@@ -228,7 +260,7 @@ def model_settings(table: Any) -> ModelSettings:
     methods = methods if isinstance(methods, list) else [methods]
     if not methods or any(type(method) is not int or method not in METHODS for method in methods):
         raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
-    return ModelSettings(human, robot, arm, tuple(dict.fromkeys(methods)))
+    return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)))
 
 
 def _check_values(job: Job) -> None:
@@ -255,12 +287,7 @@ def _check_values(job: Job) -> None:
             raise ValueError(f"{name} is {value}: it must be a number above zero")
     if not (job.window.min_velocity >= 0 and math.isfinite(job.window.min_velocity)):
         raise ValueError(f"window.min_velocity is {job.window.min_velocity}: it must be zero or more")
-    for name, value in vars(job.trust).items():
-        if isinstance(value, float) and not (value >= 0 and math.isfinite(value)):
-            raise ValueError(f"trust.{name} is {value}: it must be zero or more")
-    for name in ("min_vaf", "min_valid_share"):
-        if getattr(job.trust, name) > 1:
-            raise ValueError(f"trust.{name} is {getattr(job.trust, name)}: it is a share, between 0 and 1")
+    _check_limits(job.trust)
     if job.design is not None and job.reference_period is not None:
         raise ValueError("design and reference_period both say how long a period is: keep one of them")
     _check_gears(job)
@@ -270,6 +297,15 @@ def _check_values(job: Job) -> None:
     offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm) if part is not None]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
+
+
+def _check_limits(trust: TrustLimits) -> None:
+    for name, value in vars(trust).items():
+        if isinstance(value, float) and not (value >= 0 and math.isfinite(value)):
+            raise ValueError(f"trust.{name} is {value}: it must be zero or more")
+    for name in ("min_vaf", "min_valid_share"):
+        if getattr(trust, name) > 1:
+            raise ValueError(f"trust.{name} is {getattr(trust, name)}: it is a share, between 0 and 1")
 
 
 def _check_gears(job: Job) -> None:

@@ -189,6 +189,10 @@ _READERS: dict[str, Callable[[Path, list[str]], dict[str, Any]]] = {
 }
 
 
+FORMATS = tuple(_READERS)
+"""Extensions of files that can be read."""
+
+
 def _require(name: str, available: Iterable[str], what: str | None = None) -> None:
     choices = list(available)
     if name not in choices:

@@ -12,7 +12,8 @@ import inspect
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +25,16 @@ from numpy.typing import ArrayLike, NDArray
 from jaximp.readers import RecordingError, read_columns
 from jaximp.types import JOINT_TYPES, Recording, nearest
 
-__all__ = ["RecordingError", "load_recording", "recording_from_arrays", "recording_from_mapping", "save_recording"]
+__all__ = [
+    "RecordingError",
+    "check_mapping",
+    "load_recording",
+    "load_trial_table",
+    "recording_from_arrays",
+    "recording_from_mapping",
+    "save_recording",
+    "save_trial_table",
+]
 
 Entry = str | Sequence[str] | Mapping[str, Any]
 """One channel of the mapping: a column, a list of columns, or `{column, unit, sign, gain}`."""
@@ -37,10 +47,10 @@ LARGEST_GROWTH = 50
 """The uniform grid has at most this many samples for each measured one."""
 
 _SI = {
-    "revolute": {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2", "torque": "N m"},
-    "prismatic": {"position": "m", "velocity": "m/s", "acceleration": "m/s^2", "torque": "N"},
+    "revolute": {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2", "torque": "N m", "command": "N m"},
+    "prismatic": {"position": "m", "velocity": "m/s", "acceleration": "m/s^2", "torque": "N", "command": "N"},
 }
-_CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference")
+_CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference", "command")
 _SUFFIXES = {
     **{unit: unit for unit in ("deg", "mrad", "rad", "mm", "cm", "m", "s", "ms", "us", "N", "V", "Hz", "kHz", "rpm")},
     **{"Nm": "N m", "mNm": "mN m", "rad_s": "rad/s", "deg_s": "deg/s", "m_s": "m/s", "mm_s": "mm/s"},
@@ -81,6 +91,7 @@ def load_recording(
     acceleration: Entry | None = None,
     force: Entry | None = None,
     reference: Entry | None = None,
+    command: Entry | None = None,
     sample_rate: float | Entry | None = None,
     joint: str | Sequence[str] = "revolute",
     gear_ratio: float = 1.0,
@@ -94,36 +105,93 @@ def load_recording(
       is a header's name, a variable (`data.q` inside a MATLAB struct) or a dataset's path; MATLAB, HDF5 and NPZ
       variables may be (N, n), one column per joint.
     - `time` [s] (a column, or `{column, unit}`) or else `sample_rate`: a number [Hz], or a scalar variable in the file.
-    - `position`, `torque`, `velocity`, `acceleration`, `force`, `reference`: a column, a list of columns (one per
-      joint), or `{column = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, the SI unit of the channel:
-      rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N. A bare `gain` multiplies the column and `unit`
-      is that of the product; with `gain = "35.1507 N/V"`, `unit` is that of the column.
+    - `position`, `torque`, `velocity`, `acceleration`, `force`, `reference`, `command`: a column, a list of columns
+      (one per joint), or `{column = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, that of the channel:
+      rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N; `reference` is a position, `command` (the
+      perturbation) a torque. A bare `gain` multiplies the column and `unit` is that of the product; with
+      `gain = "35.1507 N/V"`, `unit` is that of the column.
     - `joint`: `revolute` or `prismatic`, or a list of these, one per joint.
     - `gear_ratio`: motor turns per joint turn, if the columns were measured at the motor: position, velocity,
-      acceleration and reference are divided by it, torque is multiplied; `force` acts at the endpoint and stays.
+      acceleration and reference are divided by it, torque and command are multiplied; `force` acts at the endpoint and
+      stays.
 
     **Returns:** the recording on a uniform grid; see `recording_from_arrays` for sampling, gaps and NaN.
 
     **Raises:** `FileNotFoundError`; else `ValueError` with one line that names the file, the cause and the remedy.
     """
+    entries: dict[str, Any] = {"position": position, "torque": torque, "velocity": velocity, "force": force}
+    entries |= {"acceleration": acceleration, "reference": reference, "command": command, "time": time}
+    path = _existing(path)
+    with _named(str(path)):
+        signals, joints = _read_signals(path, entries, sample_rate, joint, gear_ratio)
+        return _assemble(_stamps(signals, sample_rate), signals, joints, path.stem if name is None else name)
+
+
+def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mapping: Any) -> list[Recording]:
+    """Read the trials that stand in one file below one another, told apart by the numbers in a column.
+
+    **Arguments:** `path` and `mapping` as in `load_recording`; `trial` the column with the numbers. Rows of one number
+    are one trial, and its time may restart or run on; rows without a number (NaN) belong to none.
+
+    **Returns:** one recording each, in the order of first appearance, called `<file>, trial <number>`.
+
+    **Raises:** as `load_recording`, with the trial's number after the file's name.
+    """
+    check_mapping(mapping, f"the columns of {path}")
+    path = _existing(path)
+    rate = mapping.get("sample_rate")
+    channels = {key: mapping[key] for key in mapping if key not in ("sample_rate", "joint", "gear_ratio", "name")}
+    options = (rate, mapping.get("joint", "revolute"), mapping.get("gear_ratio", 1.0))
+    with _named(str(path)):
+        signals, joints = _read_signals(path, channels | {"trial": trial}, *options)
+        numbers = signals.pop("trial").values[:, 0]
+        scalar = {key: signals.pop(key) for key in ("sample_rate",) if key in signals}
+        _check_lengths([(trial, numbers[:, None]), *((s.labels[0], s.values) for s in signals.values())])
+        _, first = np.unique(numbers[~np.isnan(numbers)], return_index=True)
+        in_order = numbers[~np.isnan(numbers)][np.sort(first)]
+        if not len(in_order):
+            raise RecordingError(f"column {trial!r} has no trial number: name the column that tells the trials apart")
+    recordings = []
+    for number in in_order:
+        rows = numbers == number
+        with _named(f"{path}, trial {number:g}"):
+            part = {key: _Signal(signal.labels, signal.values[rows]) for key, signal in signals.items()} | scalar
+            recordings.append(_assemble(_stamps(part, rate), part, joints, f"{path.stem}, trial {number:g}"))
+    return recordings
+
+
+def _existing(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file; check the path")
-    entries: dict[str, Any] = {"position": position, "torque": torque, "velocity": velocity, "force": force}
-    entries |= {"acceleration": acceleration, "reference": reference, "time": time}
-    entries["sample_rate"] = None if _is_number(sample_rate) else sample_rate
+    return path
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Errors begin with the file that they are about."""
     try:
-        if (time is None) == (sample_rate is None):
-            raise RecordingError("give either 'time' (a column) or 'sample_rate' (in Hz), one of the two")
-        sources = {channel: _source(channel, entry) for channel, entry in entries.items() if _given(channel, entry)}
-        columns = read_columns(path, [column for source in sources.values() for column in source.columns])
-        signals = {channel: _stack(source.columns, columns) for channel, source in sources.items()}
-        joints = _joints(joint, signals["position"].values.shape[1])
-        signals = {key: _to_si(key, signal, sources[key], joints, gear_ratio) for key, signal in signals.items()}
-        stamps = _stamps(signals, sample_rate)
-        return _assemble(stamps, signals, joints, path.stem if name is None else name)
+        yield
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(f"{where}: {error}") from None
+
+
+def _read_signals(
+    path: Path, entries: Mapping[str, Any], sample_rate: Any, joint: str | Sequence[str], gear_ratio: float
+) -> tuple[dict[str, _Signal], tuple[str, ...]]:
+    """All channels of a file in SI units, the clock among them, and the joints; a `trial` column as it is."""
+    if (entries.get("time") is None) == (sample_rate is None):
+        raise RecordingError("give either 'time' (a column) or 'sample_rate' (in Hz), one of the two")
+    entries = {**entries, "sample_rate": None if _is_number(sample_rate) else sample_rate}
+    sources = {channel: _source(channel, entry) for channel, entry in entries.items() if _given(channel, entry)}
+    columns = read_columns(path, [column for source in sources.values() for column in source.columns])
+    signals = {channel: _stack(source.columns, columns) for channel, source in sources.items()}
+    joints = _joints(joint, signals["position"].values.shape[1])
+    converted = {
+        key: signal if key == "trial" else _to_si(key, signal, sources[key], joints, gear_ratio)
+        for key, signal in signals.items()
+    }
+    return converted, joints
 
 
 def recording_from_mapping(table: Mapping[str, Any], folder: str | os.PathLike[str]) -> Recording:
@@ -133,17 +201,24 @@ def recording_from_mapping(table: Mapping[str, Any], folder: str | os.PathLike[s
 
     **Raises:** `ValueError` for an unknown or missing key, and as `load_recording`.
     """
-    arguments = inspect.signature(load_recording).parameters
-    known = ["file", *list(arguments)[1:]]
-    for key in table:
-        if key not in known:
-            raise RecordingError(f"[recording]: unknown key {key!r}; {nearest(str(key), known)}")
-    for key in ("file", "position", "torque"):
-        if key not in table:
-            raise RecordingError(f"[recording]: '{key}' is missing; add it")
+    check_mapping(table, "[recording]", "file")
+    if "file" not in table:
+        raise RecordingError("[recording]: 'file' is missing; add it")
     if not isinstance(table["file"], str):
         raise RecordingError(f"[recording]: 'file' must be a path in quotes, not {table['file']!r}")
     return load_recording(Path(folder) / table["file"], **{key: table[key] for key in table if key != "file"})
+
+
+def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
+    """Refuse a mapping of columns with a key that `load_recording` (and `others`) do not know, or without those that it
+    needs."""
+    known = [*others, *list(inspect.signature(load_recording).parameters)[1:]]
+    for key in table:
+        if key not in known:
+            raise RecordingError(f"{where}: unknown key {key!r}; {nearest(str(key), known)}")
+    for key in ("position", "torque"):
+        if key not in table:
+            raise RecordingError(f"{where}: '{key}' is missing; add it")
 
 
 def recording_from_arrays(
@@ -155,6 +230,7 @@ def recording_from_arrays(
     acceleration: ArrayLike | None = None,
     force: ArrayLike | None = None,
     reference: ArrayLike | None = None,
+    command: ArrayLike | None = None,
     joint: str | Sequence[str] = "revolute",
     name: str = "recording",
 ) -> Recording:
@@ -171,7 +247,7 @@ def recording_from_arrays(
     **Raises:** `ValueError` for stamps that do not increase, infinite values, a signal that is constant or all NaN,
     fewer than 3 samples, shapes that do not match, or a gap that would make the grid 50 times as long as the data.
     """
-    arrays = zip(_CHANNELS, (position, torque, velocity, acceleration, force, reference), strict=True)
+    arrays = zip(_CHANNELS, (position, torque, velocity, acceleration, force, reference, command), strict=True)
     signals = {channel: _stack((channel,), {channel: values}) for channel, values in arrays if _given(channel, values)}
     signals["time"] = _stack(("time",), {"time": time})
     joints = _joints(joint, signals["position"].values.shape[1])
@@ -186,19 +262,37 @@ def save_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
 
     **Raises:** `ValueError` for another extension.
     """
+    _write_columns(_named_columns(recording), Path(path))
+
+
+def save_trial_table(recordings: Sequence[Recording], path: str | os.PathLike[str]) -> None:
+    """Write trials below one another into one CSV or Parquet file, which `load_trial_table` reads back equal.
+
+    Columns as in `save_recording`, and `trial`, which counts from 1.
+
+    **Raises:** `ValueError` for another extension, for no trials, and for channels that only some trials have.
+    """
+    tables = [_named_columns(recording) for recording in recordings]
+    if not tables or any(list(table) != list(tables[0]) for table in tables):
+        raise RecordingError(f"{path}: the trials must be at least one, and have the same channels: complete them")
+    columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+    numbers = np.repeat(np.arange(1, len(tables) + 1), [len(recording) for recording in recordings])
+    _write_columns({"trial": numbers, **columns}, Path(path))
+
+
+def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """A table that appears whole or not at all."""
     import pyarrow
     import pyarrow.csv
     import pyarrow.parquet
 
-    path = Path(path)
     writers = {".csv": pyarrow.csv.write_csv, ".parquet": pyarrow.parquet.write_table}
     if path.suffix.lower() not in writers:
         raise RecordingError(f"{path}: cannot write '{path.suffix}' files; use one of: {', '.join(writers)}")
-    table = pyarrow.table(_named_columns(recording))
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
     try:
         with unfinished.open("wb") as file:
-            writers[path.suffix.lower()](table, file)
+            writers[path.suffix.lower()](pyarrow.table(dict(columns)), file)
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -227,6 +321,11 @@ def _source(channel: str, entry: Any) -> _Source:
     options = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     allowed = ["column", "unit"] if channel in ("time", "sample_rate") else ["column", "unit", "sign", "gain"]
     for key in options:
+        if key == "file":
+            raise RecordingError(
+                f"{channel}: all columns of a recording come from one file and have one time base; resample it at the "
+                "times of the others, and write both into one file"
+            )
         if key not in allowed:
             raise RecordingError(f"{channel}: unknown key {key!r}; {nearest(str(key), allowed)}")
     columns, unit, sign = options.get("column"), options.get("unit"), options.get("sign", 1)
@@ -269,7 +368,9 @@ def _to_si(channel: str, signal: _Signal, source: _Source, joints: tuple[str, ..
     """The channel in SI units at the joint."""
     if not _is_number(gear_ratio) or not 0 < gear_ratio < math.inf:
         raise RecordingError(f"gear_ratio must be a positive number, not {gear_ratio!r}")
-    gear = {"torque": gear_ratio, "force": 1.0, "time": 1.0, "sample_rate": 1.0}.get(channel, 1 / gear_ratio)
+    gear = {"torque": gear_ratio, "command": gear_ratio, "force": 1.0, "time": 1.0, "sample_rate": 1.0}.get(
+        channel, 1 / gear_ratio
+    )
     # A force may have more columns than there are joints; for the other channels `_assemble` reports a wrong count.
     kinds = [joints[min(i, len(joints) - 1)] for i in range(len(signal.labels))]
     units = [_si_unit(channel, kind) for kind in kinds]
@@ -378,7 +479,7 @@ def _check_lengths(arrays: Sequence[tuple[str, NDArray[np.float64]]]) -> None:
         if len(array) != len(reference):
             raise RecordingError(
                 f"{first!r} has {len(reference)} samples, but {label!r} has {len(array)}; they must be equally long, "
-                "with the samples along the first axis"
+                "with the samples along the first axis and one time base (else resample one of them)"
             )
 
 
@@ -423,11 +524,15 @@ def _frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 def _check_shapes(clock: _Signal, signals: dict[str, _Signal], n: int) -> None:
     if len(clock.labels) != 1:
-        raise RecordingError(f"time has {len(clock.labels)} columns; name a single one")
+        raise RecordingError(
+            f"time has {len(clock.labels)} columns; name a single one (channels with times of their own: resample them)"
+        )
     for channel, signal in signals.items():
         if len(signal.labels) != n and channel != "force":
             raise RecordingError(f"{channel} has {len(signal.labels)} columns for {n} joints; give one per joint")
-    _check_lengths([(signal.labels[0], signal.values) for signal in (clock, *signals.values())])
+    # A clock that was made of a rate is as long as the position, which is then to be named.
+    compared = [*signals.values(), clock] if clock.labels == ("sample_rate",) else [clock, *signals.values()]
+    _check_lengths([(signal.labels[0], signal.values) for signal in compared])
     if len(clock.values) < 3:
         raise RecordingError(
             f"has {len(clock.values)} samples; at least 3 are needed, and a useful fit needs many more"

@@ -6,7 +6,7 @@ import tomllib
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,7 +41,7 @@ def settings(kind: type[T], table: Any, where: str) -> T:
     hints = typing.get_type_hints(kind)
     check_keys(table, list(hints), f"[{where}]")
     for setting in fields(kind):  # type: ignore[arg-type]
-        if setting.default is MISSING and setting.name not in table:
+        if setting.default is MISSING and setting.default_factory is MISSING and setting.name not in table:
             raise ValueError(f"[{where}] has no '{setting.name}': add it")
     return kind(**{key: checked(value, hints[key], f"{where}.{key}") for key, value in table.items()})
 
@@ -54,8 +54,10 @@ def checked(value: Any, hint: Any, where: str) -> Any:
         raise ValueError(f"{where} is {value!r}: it must be a list of names")
     choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for choice in choices:
-        if choice == list[float] and isinstance(value, list):
-            return [checked(item, float, where) for item in value]
+        if typing.get_origin(choice) is list and isinstance(value, list):
+            return [checked(item, typing.get_args(choice)[0], where) for item in value]
+        if is_dataclass(choice) and isinstance(value, dict):
+            return settings(typing.cast(type, choice), value, where)
         if type(value) is choice:
             return value
         if choice is float and type(value) is int:
@@ -63,12 +65,13 @@ def checked(value: Any, hint: Any, where: str) -> Any:
     expected: dict[Any, str | None] = {
         float: "a number",
         list[float]: "a list of numbers",
+        list[str]: "a list of text",
         int: "a whole number",
         bool: "true or false",
         str: "text",
         type(None): None,
     }
-    names = " or ".join(name for choice in choices if (name := expected[choice]))
+    names = " or ".join(name for choice in choices if (name := expected.get(choice, "a table")))
     raise ValueError(f"{where} is {value!r}: it must be {names}")
 
 

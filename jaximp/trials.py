@@ -19,22 +19,17 @@ from jaxtyping import Array, Bool, Float, Num
 from jaximp.job import FilterSettings
 from jaximp.least_squares import WindowFit, least_squares, variance_accounted_for
 from jaximp.models import ArmGeometry, PlanarArm, solve_pair
+from jaximp.movement_trials import NOISE, check_directions, check_hand, find_onset, trial_name
 from jaximp.objectives import solve_gram
 from jaximp.recordings import load_recording
 from jaximp.regression import design_filters, filtered
 from jaximp.signals import kept_variance
-from jaximp.types import AnyArray, Numbers, Recording
+from jaximp.types import AnyArray, Recording
 
 STEADY = 0.005
 """Before the onset the hand drifts by no more than such a share of what it moves after it."""
-NOISE = 6.0
-"""A command has left its steady state where it differs from it by so many standard deviations of its own noise."""
-LEADING = 0.05
-"""Share of a recording in which the command is steady for certain."""
 STRAIGHT = 0.05
 """Angle of the elbow [rad] below which an arm counts as straight."""
-FLAT = 0.05
-"""Smallest over largest singular value of the perturbations from which on they span the plane."""
 
 
 class Trials(eqx.Module):
@@ -122,8 +117,8 @@ def read_trials(
     """Trials from recordings of the hand, one each: joints `("prismatic", "prismatic")`, positions [m], forces [N].
 
     **Arguments:** `onset` of the perturbation [s] in each recording's own time; where it is not given it is found in
-    the `reference` of the recording, the position or force that was commanded. `before` and `after` [s] are kept around
-    it; the mean of `before` is the steady state.
+    the `command` of the recording, the force that was commanded, or in its `reference`, the position. `before` and
+    `after` [s] are kept around it; the mean of `before` is the steady state.
 
     **Raises:** `ValueError` that names the trial, for one that has no onset, is too short around it, has gaps there, is
     no recording of a hand in a plane, or was sampled at another rate.
@@ -142,8 +137,8 @@ def read_trials(
         raise ValueError(f"{before:g} s before the onset and {after:g} s after it are no two samples each: keep more")
     position, force = [], []
     for k, (recording, given) in enumerate(zip(recordings, onsets, strict=True)):
-        name = f"trial {k + 1} ({recording.name})" if recording.name else f"trial {k + 1}"
-        _check_hand(name, recording, rate)
+        name = trial_name(k, recording)
+        check_hand(name, recording, rate)
         start = recording.time[0]
         first = find_onset(name, recording) if np.isnan(given) else round((given - start) * rate)
         part = slice(first - n_before, first + n_after)
@@ -180,36 +175,6 @@ def load_trials(
     """
     recordings = [load_recording(file, joint="prismatic", **mapping) for file in files]
     return regress_trials(model, read_trials(recordings, geometry, onset, before, after), settings)
-
-
-def find_onset(name: str, recording: Recording) -> int:
-    """Index of the last sample at which the commanded position or force is still what it was at the beginning, within
-    the noise that it has there."""
-    command = recording.reference
-    if command is None:
-        raise ValueError(
-            f"{name}: its onset is not known: pass onset=, or map the commanded position or force as the reference"
-        )
-    leading = command[: max(10, round(LEADING * len(command)))]
-    away = np.abs(command - np.nanmean(leading, axis=0)).max(axis=1)
-    left = away > max(NOISE * float(np.nanstd(leading, axis=0).max()), 1e-9 * float(np.nanmax(away)))
-    # One sample beyond may be a spike: the command stays away for a while.
-    left = left & np.append(left[1:], False) & np.append(left[2:], [False, False])
-    if not left.any():
-        raise ValueError(f"{name}: no perturbation was found in its command: leave it out, or pass onset=")
-    return max(0, int(np.argmax(left)) - 1)
-
-
-def _check_hand(name: str, recording: Recording, rate: float) -> None:
-    if recording.joints != ("prismatic", "prismatic"):
-        raise ValueError(
-            f"{name} is not a recording of a hand in a plane: load it with joint='prismatic', two columns of the "
-            "position and two of the force"
-        )
-    if abs(recording.sample_rate - rate) > 1e-3 * rate:
-        raise ValueError(
-            f"{name} was sampled at {recording.sample_rate:g} Hz and trial 1 at {rate:g} Hz: resample one of them"
-        )
 
 
 def regress_trials(model: PlanarArm, trials: Trials, settings: FilterSettings) -> TrialRows:
@@ -272,7 +237,8 @@ def fit_trials(
         longest = float(rows.time[-1])
         if not 0 < float(observed) <= longest + 1.5 * float(rows.time[1] - rows.time[0] if N > 1 else 0):
             raise ValueError(f"observed is {float(observed):g} s, but the trials last {longest:.4g} s after the onset")
-        _check_directions(np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)])
+        peaks = np.asarray(rows.peaks)[slice(None) if counts is None else np.asarray(counts, bool)]
+        check_directions(peaks, f"{len(peaks)} trials")
     rows = rows.at_hand() if at_hand else rows
     shape = (T * N, n)
     counted = _observed(rows, observed, counts)
@@ -316,16 +282,6 @@ def _observed(rows: TrialRows, observed: float | AnyArray, counts: AnyArray | No
     grace = (rows.time[1] - rows.time[0]) / 2 if len(rows.time) > 1 else 0.0
     inside = (rows.time >= -grace) & (rows.time < observed + grace)
     return jnp.broadcast_to(inside, rows.W.shape[:2]) & (True if counts is None else jnp.asarray(counts)[:, None])
-
-
-def _check_directions(peaks: Numbers) -> None:
-    """Perturbations along one line tell nothing of the stiffness across it."""
-    singular = np.linalg.svd(peaks, compute_uv=False)
-    if len(peaks) < 2 or not singular[-1] > FLAT * singular[0]:
-        raise ValueError(
-            f"the directions of {len(peaks)} trials do not span the plane of the two joints: perturb in at least two "
-            "directions"
-        )
 
 
 def _check_trials(position: Array, force: Array, onset: int) -> None:

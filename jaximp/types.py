@@ -50,6 +50,8 @@ class Recording:
     """(N, k) force at the endpoint [N]."""
     reference: NDArray[np.float64] | None = None
     """(N, n) position that the controller was asked to follow."""
+    command: NDArray[np.float64] | None = None
+    """(N, n) perturbing torque (or force) that was commanded, zero before and after the perturbation."""
     name: str = "recording"
     notes: tuple[str, ...] = ()
     """What reading the file changed or noticed, in plain words."""

@@ -23,7 +23,7 @@ from hypothesis.extra import numpy as hnp
 from jaximp.recordings import load_recording, recording_from_arrays, recording_from_mapping, save_recording
 from jaximp.types import Recording
 
-CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference")
+CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference", "command")
 MAPPING = {"time": "t", "position": "q", "torque": "tau"}
 
 
@@ -183,6 +183,7 @@ DEG = np.pi / 180
         pytest.param("torque", "revolute", {"unit": "mA", "gain": "2 (N m)/A"}, 2e-3, id="torque-constant"),
         pytest.param("force", "revolute", {"unit": "kgf"}, 9.80665, id="force"),
         pytest.param("reference", "prismatic", {"unit": "cm"}, 1e-2, id="reference"),
+        pytest.param("command", "prismatic", {"unit": "kN"}, 1e3, id="command"),
     ],
 )
 def test_units(tmp_path: Path, channel: str, joint: str, entry: dict[str, Any], factor: float) -> None:
@@ -209,11 +210,12 @@ def test_time_in_milliseconds_and_mixed_joints(tmp_path: Path) -> None:
 def test_gear_ratio_brings_motor_columns_to_the_joint(tmp_path: Path) -> None:
     columns = signals()
     np.savez(tmp_path / "a.npz", **columns)
-    everything = MAPPING | dict.fromkeys(("velocity", "acceleration", "reference", "force"), "q")
+    everything = MAPPING | dict.fromkeys(("velocity", "acceleration", "reference", "command", "force"), "q")
     recording = load_recording(tmp_path / "a.npz", **everything, gear_ratio=4)
     for channel in ("position", "velocity", "acceleration", "reference"):
         np.testing.assert_allclose(getattr(recording, channel)[:, 0], columns["q"] / 4)
     np.testing.assert_allclose(recording.torque[:, 0], columns["tau"] * 4)
+    np.testing.assert_allclose(recording.command[:, 0], columns["q"] * 4)
     np.testing.assert_allclose(recording.force[:, 0], columns["q"])
 
 
@@ -249,7 +251,7 @@ def recordings(draw: st.DrawFn) -> Recording:
     size, n = draw(st.integers(3, 20)), draw(st.integers(1, 3))
     matrices = hnp.arrays(np.float64, (size, n), elements=finite)
     moving = matrices.filter(lambda values: (np.ptp(values[:3] / 4, axis=0) > 0).any())
-    optional = {c: draw(st.none() | matrices) for c in ("velocity", "acceleration", "force", "reference")}
+    optional = {c: draw(st.none() | matrices) for c in ("velocity", "acceleration", "force", "reference", "command")}
     position, torque = draw(moving), draw(moving)
     masked = draw(st.lists(st.integers(3, max(3, size - 1)), max_size=3))
     position[[row for row in masked if row < size]] = np.nan
@@ -270,7 +272,7 @@ def mapping_of_saved(recording: Recording) -> dict[str, Any]:
         values = getattr(recording, channel)
         if values is not None:
             numbers = range(1, values.shape[1] + 1) if values.shape[1] > 1 else [""]
-            kind = "position" if channel == "reference" else channel
+            kind = {"reference": "position", "command": "torque"}.get(channel, channel)
             suffixes = ["N" if channel == "force" else units[joint][kind] for joint in recording.joints]
             mapping[channel] = [f"{channel}{k}_{suffix}" for k, suffix in zip(numbers, suffixes, strict=True)]
     return mapping
