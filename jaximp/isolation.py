@@ -67,12 +67,29 @@ class Deviations(eqx.Module):
     """Of the handle on the hand [N]."""
 
 
+class Impedance(eqx.Module):
+    """Damping and stiffness of the joints, from a method that estimates them itself."""
+
+    D: Float[Array, "2 2"]
+    """[N m s/rad]"""
+    K: Float[Array, "2 2"]
+    """Symmetric [N m/rad]."""
+    covariance: Float[Array, "7 7"]
+    """Of D11, D12, D21, D22, K11, K12, K22."""
+    dof: Float[Array, ""]
+    """Degrees of freedom: a quantile of Student's t with so many makes the intervals."""
+    misfit: Float[Array, ""]
+    """Mean square of the residuals over what was expected: far above one, something is wrong."""
+
+
 class Isolated(eqx.Module):
     """What a method makes of the trials."""
 
     deviations: Deviations
     cutoff: Numbers | None = None
     """(2,) cut-off frequencies of the high-pass [Hz], where there was one."""
+    impedance: Impedance | None = None
+    """Where the method estimates it."""
 
 
 @eqx.filter_jit
