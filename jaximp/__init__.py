@@ -8,6 +8,16 @@ from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, lea
 from jaximp.perturbations import Perturbations, design_perturbations
 from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.recursive import RecursiveFit, recursive_least_squares
+from jaximp.stiffness import (
+    LinearFit,
+    StiffnessFit,
+    fit_stiffness,
+    fit_stiffness_linear,
+    fit_triangles,
+    fit_triangles_linear,
+    merge_triangles,
+    residual_triangle,
+)
 from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 from jaximp.trials import fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
@@ -22,6 +32,7 @@ __all__ = [
     "FourierSeries",
     "Job",
     "Limits",
+    "LinearFit",
     "MinimumJerk",
     "Perturbations",
     "RaisedSine",
@@ -29,6 +40,7 @@ __all__ = [
     "RecursiveFit",
     "SixthOrder",
     "SlidingFit",
+    "StiffnessFit",
     "TrustLimits",
     "WindowFit",
     "adaptive_least_squares",
@@ -37,7 +49,11 @@ __all__ = [
     "confidence_interval",
     "design_excitation",
     "design_perturbations",
+    "fit_stiffness",
+    "fit_stiffness_linear",
     "fit_trials",
+    "fit_triangles",
+    "fit_triangles_linear",
     "identify",
     "identify_recording",
     "jerk",
@@ -45,6 +61,7 @@ __all__ = [
     "least_squares",
     "load_recording",
     "load_trials",
+    "merge_triangles",
     "models",
     "parse_job",
     "predict_trials",
@@ -53,6 +70,7 @@ __all__ = [
     "recording_from_arrays",
     "recursive_least_squares",
     "regress_trials",
+    "residual_triangle",
     "save_recording",
     "sliding_least_squares",
     "sliding_pieces",
