@@ -16,6 +16,16 @@ from jaximp.recordings import (
     save_trial_table,
 )
 from jaximp.recursive import RecursiveFit, recursive_least_squares
+from jaximp.stiffness import (
+    LinearFit,
+    StiffnessFit,
+    fit_stiffness,
+    fit_stiffness_linear,
+    fit_triangles,
+    fit_triangles_linear,
+    merge_triangles,
+    residual_triangle,
+)
 from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 from jaximp.trials import fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
 from jaximp.trust import TrustLimits, confidence
@@ -31,6 +41,7 @@ __all__ = [
     "Handle",
     "Job",
     "Limits",
+    "LinearFit",
     "MinimumJerk",
     "Movements",
     "Perturbations",
@@ -39,6 +50,7 @@ __all__ = [
     "RecursiveFit",
     "SixthOrder",
     "SlidingFit",
+    "StiffnessFit",
     "TrustLimits",
     "WindowFit",
     "adaptive_least_squares",
@@ -47,7 +59,11 @@ __all__ = [
     "confidence_interval",
     "design_excitation",
     "design_perturbations",
+    "fit_stiffness",
+    "fit_stiffness_linear",
     "fit_trials",
+    "fit_triangles",
+    "fit_triangles_linear",
     "identify",
     "identify_recording",
     "jerk",
@@ -57,6 +73,7 @@ __all__ = [
     "load_recording",
     "load_trial_table",
     "load_trials",
+    "merge_triangles",
     "models",
     "parse_job",
     "predict_trials",
@@ -67,6 +84,7 @@ __all__ = [
     "recording_from_arrays",
     "recursive_least_squares",
     "regress_trials",
+    "residual_triangle",
     "save_recording",
     "save_trial_table",
     "sliding_least_squares",

@@ -11,6 +11,16 @@ from jaximp.models.arm import (
     rigid_body_torque,
 )
 from jaximp.models.base import MOTION, Combined, Joints, Model, Stacked, combine
+from jaximp.models.endpoint import (
+    Ellipse,
+    EndpointImpedance,
+    ellipse,
+    endpoint_damping,
+    endpoint_impedance,
+    endpoint_inertia,
+    endpoint_stiffness,
+    propagated_stderr,
+)
 from jaximp.models.joint import HumanJoint, RobotJoint, parameter_units
 from jaximp.models.kinematics import ArmGeometry, solve_pair
 
@@ -19,6 +29,8 @@ __all__ = [
     "ArmGeometry",
     "ArmLinks",
     "Combined",
+    "Ellipse",
+    "EndpointImpedance",
     "HumanJoint",
     "Joints",
     "Model",
@@ -28,10 +40,16 @@ __all__ = [
     "borner_from_lakatos",
     "combine",
     "coriolis_matrix",
+    "ellipse",
+    "endpoint_damping",
+    "endpoint_impedance",
+    "endpoint_inertia",
+    "endpoint_stiffness",
     "gravity_torque",
     "lakatos_from_borner",
     "mass_matrix",
     "parameter_units",
+    "propagated_stderr",
     "rigid_body_torque",
     "solve_pair",
 ]
