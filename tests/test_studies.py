@@ -111,7 +111,7 @@ def test_borner2020_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(borner2020, name, values)
     borner2020.reproduce(tmp_path)
     figures = {path.stem for path in tmp_path.glob("*.png")}
-    assert figures == {"figure_4", "figure_7", "figure_8", "figure_9", "figure_12"}
+    assert figures == {"figure_4", "figure_7", "figure_8", "figure_9", "figure_11", "figure_12"}
     tables = json.loads((tmp_path / "tables.json").read_text(), parse_constant=pytest.fail)
     means = {method: [mean for mean, _ in row] for method, row in tables["table_1A"].items()}
     for method in ("FJI", "GOM", "ERD"):

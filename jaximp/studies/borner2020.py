@@ -1,7 +1,7 @@
 """`jaximp reproduce borner2020`: involuntary impedance during a reaching movement, isolated and estimated.
 
-Tables 1 and 2 and figures 4, 7, 8, 9 from the simulation of `arm_experiments`, figure 12 and a table 3 with simulated
-subjects in place of the paper's participants.
+Tables 1 and 2 and figures 4, 7, 8, 9 from the simulation of `arm_experiments`; figures 11 and 12 and a table 3 with
+simulated subjects in place of the paper's participants.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from jaximp.isolation import (
     static_fit,
     static_inertia,
 )
-from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm
+from jaximp.models import EndpointImpedance, endpoint_impedance, lakatos_from_borner
+from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach
 from jaximp.stiffness import fit_triangles, fit_triangles_linear, residual_triangle
 from jaximp.studies.arm_experiments import (
     QUANTITIES,
@@ -428,6 +429,21 @@ def _draw(folder: Path, original: dict[str, list[Errors]], swept: dict[str, Any]
         ("figure_12", _window_panels(builds), 1),
     ):
         (folder / f"{name}.png").write_bytes(plots.png(plots.curves(panels, columns)))
+    (folder / "figure_11.png").write_bytes(plots.png(_ellipses(builds)))
+
+
+def _ellipses(builds: list[dict[str, Any]]) -> Any:
+    """Figure 11: impedance at the hand where the perturbation begins, of the mean over all subjects."""
+    arm = NeuromuscularArm()
+    q = arm.geometry.inverse(jnp.array([0.0, float(Reach().trigger)]))
+
+    def at_hand(inertia: str, D: str, K: str) -> EndpointImpedance:
+        of_joints = (np.mean([row[key] for row in builds], axis=0) for key in (inertia, D, K))
+        pi, damping, stiffness = (x.mean(axis=0) if x.ndim == 3 else x for x in of_joints)
+        return endpoint_impedance(arm.geometry, q, lakatos_from_borner(pi), damping, stiffness)
+
+    found = at_hand("inertia", "D", "K")
+    return plots.ellipses(arm.geometry, np.asarray(q), {"FJI": found}, at_hand("true_inertia", "true_D", "true_K"))
 
 
 def _profile_panels() -> list[plots.Panel]:
