@@ -91,7 +91,10 @@ USUAL_STDERR = (0.012, 0.025, 0.022)
 """Of the base inertial parameters from the static task, as a share of them."""
 START = (2.0, 1.0, 1.0, 1.2, 20.0, 10.0, 12.0)
 """Where D [N m s/rad] and K [N m/rad] begin."""
-ITERATIONS = 4
+ITERATIONS = 8
+"""At most."""
+SMALL_STEP = 0.05
+"""In standard errors, of D and K: the iteration ends."""
 DELAYS = 0.01
 """Largest delay that can be found [s]."""
 STEP = 1 / 4000
@@ -196,13 +199,15 @@ def output_error(
     past, measured = _flat(_binned(perturbed, bins.before, 0, bins)), _flat(_binned(perturbed, 0, bins.after, bins))
     target = prior.predict(past) - measured
 
-    theta, last, everyone = known.start, np.inf, np.arange(len(perturbed))
+    theta = known.start
     for _ in range(ITERATIONS):
-        step = _Linear.of(theta, target, lanes, geometry, handle, prior).solve(everyone, known)
-        theta, last = step.theta, np.abs(step.theta - theta)
-    linear = _Linear.of(theta, target, lanes, geometry, handle, prior)
+        linear = _Linear.of(theta, target, lanes, geometry, handle, prior)
+        step = linear.solve(np.arange(len(perturbed)), known)
+        theta = step.theta
+        rest = bool((np.abs(theta - linear.theta)[:7] < SMALL_STEP * np.sqrt(np.diag(step.covariance))[:7]).all())
+        if rest:
+            break
     steps = [linear.solve(members, known) for members in chosen]
-    rest = bool((last[:7] < 0.1 * np.sqrt(np.diag(steps[0].covariance))[:7]).all())
     found = _Step(*(np.stack(x) if groups is not None else np.asarray(x[0]) for x in zip(*steps, strict=True)))
     theta_of, matrix = found.theta, (*found.theta.shape[:-1], 2, 2)
     return OutputErrorFit(
@@ -556,28 +561,28 @@ class _Linear(NamedTuple):
         step = inverse @ (np.einsum("tpb,tb->p", Z, r) + known.P @ (known.start - self.theta))
 
         influence = inverse @ Z
-        of_unseen = np.einsum("tpb,nb->tnp", influence, self.unseen)
+        of_unseen = self.unseen @ influence.swapaxes(1, 2)
         # What every unperturbed trial adds to the variance: of all trials' own errors, and of the mean's.
         added = (of_unseen**2).sum(axis=0)
         of_mean = of_unseen.sum(axis=0) / n
         apart = inverse @ ((X - X.mean(axis=0)) * self.spread)
         covariance = (
-            np.einsum("tnp,tnq->pq", of_unseen, of_unseen) / n
+            (of_unseen.swapaxes(1, 2) @ of_unseen).sum(axis=0) / n
             + of_mean.T @ of_mean
             + (apart @ apart.swapaxes(1, 2)).sum(axis=0)
             + inverse @ known.P @ inverse
         )
-        share = added.mean(axis=0) / np.diag(covariance)
-        dof = 2 * (added.mean(axis=0) / share) ** 2 * n / np.maximum(((added - added.mean(axis=0)) ** 2).mean(axis=0), 1e-300)
-        return _Step(self.theta + step, covariance, dof, self._chi2(members, step, Z, inverse))
+        dof = 2 * n * np.diag(covariance) ** 2 / np.maximum(added.var(axis=0), 1e-300)
+        return _Step(self.theta + step, covariance, dof, np.asarray(self._chi2(members, step, Z, inverse)))
 
     def _chi2(self, members: np.ndarray, step: Numbers, Z: Numbers, inverse: Numbers) -> float:
         """Sum of squares of the residuals of a group over its expectation, less what the fit takes of it."""
         W, left = self.W[members], self.white[members] - self.S[members] @ step
         own = self.S[members] * self.spread
         errors = self.unseen.T @ self.unseen / len(self.unseen) + own @ own.swapaxes(1, 2)
-        expected = (W * errors).sum() - np.einsum("pq,tqb,tbc,tpc->", inverse, Z, errors, Z)
-        return float(np.einsum("tb,tbc,tc->", left, W, left) / expected)
+        taken = (inverse * (Z @ errors @ Z.swapaxes(1, 2)).sum(axis=0)).sum()
+        weighted = (W @ left[..., None])[..., 0]
+        return float((weighted * left).sum() / ((W * errors).sum() - taken))
 
 
 # What can be wrong with the trials.
