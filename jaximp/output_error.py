@@ -60,7 +60,7 @@ from jaxtyping import Array, Bool, Float, Integer, Num
 from scipy.stats import t as student
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
-from jaximp.movements import Handle, Movements
+from jaximp.movements import Deviations, Handle, Movements
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray, Numbers
 
@@ -105,19 +105,6 @@ MISFIT = 2.0
 PAIRS = np.array([0, 1, 1, 2])
 """Which of K11, K12, K22 an element of a matrix is."""
 KAPPA, INERTIA, DELAY = slice(7, 14), slice(14, 17), 17
-
-
-class Deviations(eqx.Module):
-    """Unperturbed less perturbed, at full rate from the onset on; the first sample is that of the onset."""
-
-    position: Float[Array, "T S 2"]
-    """Of the hand [m]."""
-    velocity: Float[Array, "T S 2"]
-    """[m/s]"""
-    acceleration: Float[Array, "T S 2"]
-    """[m/s^2]"""
-    force: Float[Array, "T S 2"]
-    """Of the handle on the hand [N]."""
 
 
 class OutputErrorFit(eqx.Module):
@@ -466,9 +453,7 @@ def _linearised(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Hand
 
 
 @eqx.filter_jit
-def _full_rate(
-    theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Movements
-) -> Deviations:
+def _full_rate(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Movements) -> Deviations:
     """At the rate of the measurement."""
     change = _deviation(theta, lanes, geometry, handle)
     measured = [_last(x[:: lanes.finer]) for x in (lanes.q, lanes.dq, lanes.ddq)]
