@@ -57,6 +57,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
+from scipy.interpolate import CubicSpline
 from scipy.stats import t as student
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
@@ -203,7 +204,7 @@ def output_error(
     for _ in range(ITERATIONS):
         linear = _Linear.of(theta, target, lanes, geometry, handle, prior)
         step = linear.solve(np.arange(len(perturbed)), known)
-        theta = step.theta
+        theta = known.within(step.theta)
         rest = bool((np.abs(theta - linear.theta)[:7] < SMALL_STEP * np.sqrt(np.diag(step.covariance))[:7]).all())
         if rest:
             break
@@ -370,14 +371,14 @@ def _in_lanes(perturbed: Movements, geometry: ArmGeometry, handle: Handle, bins:
     room = int(np.ceil(DELAYS * rate))
 
     def cut(x: Any, first: int, last: int) -> Numbers:
-        """(S, 2, T), with new samples between the old on straight lines."""
+        """(S, 2, T), with new samples between the old by a cubic spline."""
         x = np.asarray(x)
         samples = np.clip(onset[:, None] + np.arange(first, last + 1), 0, x.shape[1] - 1)
         x = np.moveaxis(x[np.arange(len(x))[:, None], samples], 0, -1)
-        at = np.arange((len(x) - 1) * finer + 1) / finer
-        whole = np.minimum(at.astype(int), len(x) - 2)
-        part = (at - whole)[:, None, None]
-        return (1 - part) * x[whole] + part * x[whole + 1]
+        if finer == 1:
+            return x
+        at = np.arange(len(x))
+        return CubicSpline(at, x)(np.arange((len(x) - 1) * finer + 1) / finer)
 
     end = bins.after * bins.width
     motion = [_last(cut(x, 0, end)) for x in (perturbed.position, perturbed.velocity, perturbed.acceleration)]
@@ -466,9 +467,7 @@ def _linearised(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Hand
 
 
 @eqx.filter_jit
-def _full_rate(
-    theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Movements
-) -> Deviations:
+def _full_rate(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Movements) -> Deviations:
     """At the rate of the measurement."""
     change = _deviation(theta, lanes, geometry, handle)
     measured = [_last(x[:: lanes.finer]) for x in (lanes.q, lanes.dq, lanes.ddq)]
@@ -509,6 +508,14 @@ class _Known(NamedTuple):
         P = np.zeros((18, 18))
         P[KAPPA, KAPPA], P[INERTIA, INERTIA] = np.linalg.inv(trend), np.diag(sd**-2.0)
         return cls(np.concatenate([START, np.zeros(7), pi, [0.0]]), P)
+
+    def within(self, theta: Numbers) -> Numbers:
+        """Where the arm can be simulated: trials that no impedance explains lead the iteration anywhere."""
+        limit = np.full(18, np.inf)
+        limit[:7], limit[KAPPA], limit[DELAY] = 10 * self.start[:7], 2.0, 0.9 * DELAYS
+        low, high = -limit, limit
+        low[INERTIA], high[INERTIA] = self.start[INERTIA] / 2, 2 * self.start[INERTIA]
+        return np.clip(theta, low, high)
 
 
 class _Step(NamedTuple):

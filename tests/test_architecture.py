@@ -19,7 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report", "check"),
     ("plots",),
     ("identify",),
-    ("trials", "perturbations"),
+    ("trials", "perturbations", "output_error"),
     ("regression",),
     ("design",),
     ("job",),

@@ -201,7 +201,7 @@ def feedforward(
     held = arm.handle.force(jnp.zeros_like(q), *geometry.hand_motion(q, dq, ddq)[1:])
     torque = rigid_body_torque(q, dq, ddq, arm.xi) - geometry.joint_torque(q, held)
 
-    def improve(_: int, nu: Array) -> Array:
+    def improve(_: Any, nu: Array) -> Array:
         pull = nu @ A.T
         active = (pull > 0).astype(pull.dtype)
         slope = jnp.einsum("...m,mi,mj->...ij", active, A, A) + 1e-12 * jnp.eye(2)
