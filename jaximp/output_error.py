@@ -139,7 +139,8 @@ class OutputErrorFit(eqx.Module):
     dof: Float[Any, "*G 18"]
     """Degrees of freedom for Student's t: how well the unperturbed trials tell the variance."""
     chi2: Float[Any, "*G"]
-    """Weighted sum of squares of the residuals over what is expected of it: about 1."""
+    """Weighted sum of squares of the residuals over what is expected of it: about 1, or less where trials differ less
+    than `SPREAD` allows."""
     ok: Bool[Any, "*G"]
     """Whether the iteration came to rest, all is finite and chi2 is at most `MISFIT`."""
     residual: Float[Any, "T B 2"]
