@@ -178,7 +178,7 @@ def feedback_jerk_isolation(
         filter_zero_phase(butterworth(FILTER_ORDER, float(f), perturbed.sample_rate, "highpass"), of_all[..., axis].T).T
         for axis, f in enumerate(cutoff)
     ]
-    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, _samples(perturbed, window)), cutoff)
+    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, window_samples(perturbed, window)), cutoff)
 
 
 @eqx.filter_jit
@@ -211,7 +211,7 @@ def mean_of_perturbed(
     def deviation(x: Array) -> Array:
         return x[:, :1] + (x - x[:, :1]).mean(axis=0) - x
 
-    seen = in_window(perturbed, _samples(perturbed, window))
+    seen = in_window(perturbed, window_samples(perturbed, window))
     return Isolated(Deviations(*map(deviation, (seen.position, seen.velocity, seen.acceleration, seen.force))))
 
 
@@ -222,7 +222,7 @@ def state_at_onset(
 
     **Source:** Erden and Billard 2015, as in Börner et al. 2020, 1.1; meant for postures and slow work.
     """
-    seen = in_window(perturbed, _samples(perturbed, window))
+    seen = in_window(perturbed, window_samples(perturbed, window))
     return Isolated(
         Deviations(
             seen.position[:, :1] - seen.position, -seen.velocity, -seen.acceleration, seen.force[:, :1] - seen.force
@@ -230,8 +230,11 @@ def state_at_onset(
     )
 
 
-def _samples(movements: Movements, window: float) -> int:
-    """In a window that begins with the onset and has both of its ends."""
+def window_samples(movements: Movements, window: float) -> int:
+    """In a window that begins with the onset and has both of its ends.
+
+    **Raises:** `ValueError` for a window that is longer than a trial lasts after its onset.
+    """
     samples = round(window * movements.sample_rate) + 1
     left = movements.position.shape[-2] - int(np.max(np.asarray(movements.onset)))
     if samples > left:
@@ -339,6 +342,8 @@ class Method(NamedTuple):
     isolate: Callable[..., Isolated]
     linearised: bool = False
     """Whether its authors take the inertia to first order, and leave the stiffness asymmetric."""
+    smooth: bool = True
+    """Whether it wants position and force smoothed as the derivatives are (`read_movements`), or as measured."""
 
 
 METHODS = {
