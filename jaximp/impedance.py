@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +39,7 @@ from jaximp.stiffness import (
     ELEMENTS,
     FEWEST_TRIALS,
     REASONS,
+    StiffnessFit,
     fit_triangles,
     fit_triangles_linear,
     residual_triangle,
@@ -57,8 +57,15 @@ from jaximp.trust import (
 )
 from jaximp.types import AnyArray, Numbers, Progress, nearest
 
+USUAL = TrustLimits()
 UNITS = {"D": "N m s/rad", "K": "N m/rad"}
 MATRICES = {"D": "damping", "K": "stiffness"}
+JERK_BIAS = (
+    "feedback jerk isolation: its stiffness came out a quarter too large on simulated recordings (the filter of the "
+    "derivatives blurs the onset, from which the jerk is integrated), and 5 to 10 % too small on simulated motion that "
+    "is exactly known; the standard errors know of neither, see the README"
+)
+"""What users of `feedback_jerk` must know: nine recordings of `simulate arm`, and the simulated subjects."""
 MISFIT = 1.5
 """Mean square of the residuals over what was expected from which on a method's own estimate is not believed."""
 SHORTEST, BEYOND, LENGTHS = 0.04, 1.5, 16
@@ -172,14 +179,14 @@ def identify_impedance(
     method: str,
     window: float = VOLUNTARY_DELAY,
     cutoff: Num[AnyArray, "2"] | None = None,
-    limits: TrustLimits = TrustLimits(),
+    limits: TrustLimits = USUAL,
     notes: Sequence[str] = (),
 ) -> ArmImpedance:
     """Isolate what the perturbations changed, fit damping and stiffness of the joints to it, and judge the estimate.
 
-    A method that estimates the impedance itself is taken at its word; to the deviations of the others D and a symmetric,
-    positive semidefinite K are fitted (to those of a linearised one a K of four free numbers). Standard errors come
-    from how much the trials contradict each other, and from those of the inertia.
+    A method that estimates the impedance itself is taken at its word; to the deviations of the others D and a
+    symmetric, positive semidefinite K are fitted (to those of a linearised one a K of four free numbers). Standard
+    errors come from how much the trials contradict each other, and from those of the inertia.
 
     **Arguments:** movements as `read_movements` makes them; `method` is a key of `isolation.METHODS`; `window` [s]
     after the onset; `cutoff` (2,) [Hz] for methods that have a high-pass; `notes` from reading.
@@ -310,7 +317,7 @@ def _fitted(triangles: Float[Array, "4 T 6 6"], samples: int, linearised: bool) 
         covariance=np.asarray(fit.covariance)[0] + of_inertia.T @ of_inertia,
         dof=float(fit.dof[0]),
         why=str(fit.why()[0]),
-        on_boundary=not linearised and bool(fit.on_boundary[0]),
+        on_boundary=isinstance(fit, StiffnessFit) and bool(fit.on_boundary[0]),
         held_out=float(1 - left / torque) if torque > 0 else np.nan,
         unconstrained=np.asarray(free.K)[0],
     )
@@ -415,7 +422,7 @@ def _matrix_rules(result: ArmImpedance, unconstrained: Numbers, limits: TrustLim
 
 def criteria(result: ArmImpedance, which: str) -> MatrixCriteria:
     """Eigenvalues and asymmetry of `damping` or `stiffness`, with their standard errors."""
-    letter = which[0].upper() if which == "damping" else "K"
+    letter = next(letter for letter, word in MATRICES.items() if word == which)
     full = np.zeros((4, len(result.names)))
     for k, name in enumerate(f"{letter}{i}{j}" for i in (1, 2) for j in (1, 2)):
         full[k, result.names.index(name if name in result.names else "K12")] = 1.0
@@ -495,9 +502,6 @@ def _warnings(result: ArmImpedance, limits: TrustLimits) -> tuple[str, ...]:
     return tuple(filter(None, found))
 
 
-JERK_BIAS = ""
-
-
 def _asymmetry(result: ArmImpedance, limits: TrustLimits) -> list[str]:
     stiffness = criteria(result, "stiffness")
     if not stiffness.surely_asymmetric(limits)[0]:
@@ -563,7 +567,9 @@ def _fitted_at(
 
     def triangles(valid: Array) -> Array:
         def of(torque: Array) -> Array:
-            return residual_triangle(joint.displacement, joint.velocity, torque, jnp.broadcast_to(valid, torque.shape[:-1]))
+            return residual_triangle(
+                joint.displacement, joint.velocity, torque, jnp.broadcast_to(valid, torque.shape[:-1])
+            )
 
         return jax.vmap(of)(torques)
 
@@ -643,9 +649,7 @@ def check_trials(job: Job) -> None:
     assert arm is not None
     for method in trials.methods:
         if method not in METHODS:
-            raise ValueError(
-                f"trials.method '{method}' is not in this version yet: choose from {', '.join(METHODS)}"
-            )
+            raise ValueError(f"trials.method '{method}' is not in this version yet: choose from {', '.join(METHODS)}")
     if trials.task == "posture":
         raise ValueError(
             "a job of postures alone tells the inertia and no impedance in motion: put their file into "

@@ -178,7 +178,9 @@ def feedback_jerk_isolation(
         filter_zero_phase(butterworth(FILTER_ORDER, float(f), perturbed.sample_rate, "highpass"), of_all[..., axis].T).T
         for axis, f in enumerate(cutoff)
     ]
-    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, window_samples(perturbed, window)), cutoff)
+    return Isolated(
+        _integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, window_samples(perturbed, window)), cutoff
+    )
 
 
 @eqx.filter_jit

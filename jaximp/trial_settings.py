@@ -200,7 +200,7 @@ def _posture_settings(table: Any, trials: TrialsSettings, columns: list[str]) ->
         raise ValueError(f"{where} belongs to movements: leave out trials.task, or {where}")
     check_keys(table, [*_POSTURE, *columns], where)
     mapping = {key: value for key, value in table.items() if key in columns}
-    instead = {key: _ASKED for key in _ASKED} | {"sample_rate": ("time",), "time": ("sample_rate",)}
+    instead = dict.fromkeys(_ASKED, _ASKED) | {"sample_rate": ("time",), "time": ("sample_rate",)}
     replaced = {other for key in mapping for other in instead.get(key, ())}
     mapping = {key: value for key, value in trials.mapping.items() if key not in replaced} | mapping
     check_mapping(mapping, where)

@@ -66,6 +66,7 @@ reference = ["reference1_m", "reference2_m"]  # what the handle was asked to fol
 lengths = {lengths}                      # m
 """
 
+
 @dataclass(frozen=True)
 class Sensors:
     """What the recordings add to the simulation."""
