@@ -261,6 +261,8 @@ def _identify_trials_into(job: Job, folder: Path) -> None:
         progress(1.0)
     for estimate in result.estimates:
         _say_impedance(estimate)
+    for note in result.main.notes:
+        typer.echo(f"note: {note}")
 
 
 def _say_impedance(found: ArmImpedance) -> None:

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from jaximp import plots
 from jaximp.impedance import MISFIT, ArmImpedance, TrialsResult
+from jaximp.isolation import METHODS
 from jaximp.job import Job
 from jaximp.pages import inline, percent, table_of, template, versions, without_nan, write_figures, write_summary
 from jaximp.types import Numbers
@@ -152,6 +153,7 @@ def _result(found: ArmImpedance) -> dict[str, Any]:
     low, high = found.interval()
     return {
         "method": found.method,
+        "method_short": METHODS[found.method].short,
         "method_description": found.title,
         "window_s": found.window,
         "trials": found.trials,

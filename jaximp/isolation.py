@@ -115,7 +115,7 @@ def jerk(movements: Movements) -> Float[Array, "T N 2"]:
 def energy_spectra(perturbed: Movements, unperturbed: Movements) -> tuple[Numbers, Numbers, Numbers]:
     """Mean energy spectral densities of the jerk, eq. (24), with the feedback's as what perturbed trials have more.
 
-    **Returns:** frequencies (F,) up to 50 Hz, and densities (F, 2) of unperturbed and perturbed trials [m^2/s^4/Hz^2].
+    **Returns:** frequencies (F,) up to 50 Hz, and densities (F, 2) of unperturbed and perturbed trials [m^2/s^4].
     """
     rate = perturbed.sample_rate
     # Means of short blocks say all that there is to say of frequencies so low.

@@ -63,7 +63,7 @@ def jerk_spectra(spectra: tuple[Numbers, Numbers, Numbers], cutoff: Numbers | No
             panel.set_title(f"axis {axis}: high-pass from {cutoff[k]:.3g} Hz on", loc="left")
         panel.set(xlabel="frequency [Hz]", xlim=(0, HIGHEST), ylim=(1e-6 * largest, 3 * largest))
         panel.minorticks_off()
-    panels[0].set_ylabel("energy spectral density\nof the jerk [m²/s⁴/Hz²]")
+    panels[0].set_ylabel("energy spectral density\nof the jerk [m²/s⁴]")
     _legend_below(figure, panels[0])
     return figure
 
@@ -85,7 +85,8 @@ def joint_torques(found: ArmImpedance) -> Figure:
         panels[0, column].set_title(f"perturbed trial {trial + 1}", loc="left")
     for joint, panel in enumerate(panels[:, 0]):
         panel.set_ylabel(f"torque of joint {joint + 1} [N m]")
-    figure.supxlabel("time since the onset [ms]", fontsize=8.5)
+    for panel in panels[-1]:
+        panel.set_xlabel("since the onset [ms]")
     figure.align_ylabels()
     _legend_below(figure, panels[0, 0])
     return figure
@@ -109,7 +110,9 @@ def impedance_windows(windows: OtherWindows, chosen: float, level: float = 0.95)
             panel.axvline(1e3 * chosen, color=ORANGE, linestyle=":", label="window of the job")
         at_chosen = int(np.abs(windows.window - chosen).argmin())
         panel.set(xlim=(length[0], length[-1]), ylim=_limits(theta, low[:, k], high[:, k], at_chosen))
-    figure.supxlabel("window after the onset [ms]", fontsize=8.5)
+    for name in windows.names:
+        if name[0] == "K":
+            panels[name].set_xlabel("window [ms]")
     _legend_below(figure, panels[windows.names[0]])
     return figure
 
