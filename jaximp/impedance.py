@@ -7,7 +7,8 @@ and write no files.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +30,6 @@ from jaximp.isolation import (
     in_window,
     joint_deviations,
     static_inertia,
-    window_samples,
 )
 from jaximp.job import Job
 from jaximp.least_squares import confidence_interval
@@ -666,6 +666,15 @@ def _cutoff(trials: TrialsSettings) -> Numbers | None:
     return None if trials.cutoff is None else np.array(trials.cutoff)
 
 
+@contextmanager
+def _in_postures() -> Iterator[None]:
+    """Errors say which of the two tables is meant."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"[trials.posture]: {error}") from None
+
+
 class _Known:
     """What a job knows of the arm, read once."""
 
@@ -678,11 +687,8 @@ class _Known:
         self.notes: tuple[str, ...] = ()
         self.postures = 0
         if self._table is not None:
-            try:
+            with _in_postures():
                 self._movements, _, notes = self._table.load()
-                window_samples(self._movements, self._table.window)
-            except ValueError as error:
-                raise ValueError(f"[trials.posture]: {error}") from None
             self.notes = tuple(f"postures: {note}" for note in notes)
             self.postures = len(self._movements)
 
@@ -692,7 +698,8 @@ class _Known:
             return None
         if linearised not in self._found:
             geometry = self._settings.geometry()
-            self._found[linearised] = static_inertia(self._movements, geometry, self._table.window, linearised)
+            with _in_postures():
+                self._found[linearised] = static_inertia(self._movements, geometry, self._table.window, linearised)
         return self._found[linearised]
 
     def arm(self, linearised: bool) -> KnownArm:

@@ -233,7 +233,7 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "method": content["method_description"],
         "window": f"{1e3 * content['window_s']:.4g} ms after the onset",
         "high-pass of the jerk": "none" if cutoff is None else numbers(cutoff, "Hz"),
-        "mean place of the hand at the onset": numbers(content["hand_at_onset_m"], "m"),
+        "mean place of the hand at the onset": f"{', '.join(f'{x:.3f}' for x in content['hand_at_onset_m'])} m",
         "lengths of the arm": numbers(arm["lengths_m"], "m"),
         f"inertia, {'as given' if arm['inertia_from'] == 'given' else 'from ' + arm['inertia_from']}": inertia,
         "mass and damping of the handle": f"{numbers(arm['handle_mass_kg'], 'kg')}; "

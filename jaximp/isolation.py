@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Bool, Float, Num
 from scipy.fft import next_fast_len
 
 from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
@@ -178,9 +178,7 @@ def feedback_jerk_isolation(
         filter_zero_phase(butterworth(FILTER_ORDER, float(f), perturbed.sample_rate, "highpass"), of_all[..., axis].T).T
         for axis, f in enumerate(cutoff)
     ]
-    return Isolated(
-        _integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, window_samples(perturbed, window)), cutoff
-    )
+    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, _samples(perturbed, window)), cutoff)
 
 
 @eqx.filter_jit
@@ -213,7 +211,7 @@ def mean_of_perturbed(
     def deviation(x: Array) -> Array:
         return x[:, :1] + (x - x[:, :1]).mean(axis=0) - x
 
-    seen = in_window(perturbed, window_samples(perturbed, window))
+    seen = in_window(perturbed, _samples(perturbed, window))
     return Isolated(Deviations(*map(deviation, (seen.position, seen.velocity, seen.acceleration, seen.force))))
 
 
@@ -224,7 +222,7 @@ def state_at_onset(
 
     **Source:** Erden and Billard 2015, as in Börner et al. 2020, 1.1; meant for postures and slow work.
     """
-    seen = in_window(perturbed, window_samples(perturbed, window))
+    seen = in_window(perturbed, _samples(perturbed, window))
     return Isolated(
         Deviations(
             seen.position[:, :1] - seen.position, -seen.velocity, -seen.acceleration, seen.force[:, :1] - seen.force
@@ -232,7 +230,7 @@ def state_at_onset(
     )
 
 
-def window_samples(movements: Movements, window: float) -> int:
+def _samples(movements: Movements, window: float) -> int:
     """In a window that begins with the onset and has both of its ends.
 
     **Raises:** `ValueError` for a window that is longer than a trial lasts after its onset.
@@ -286,6 +284,9 @@ def joint_deviations(
     return JointDeviations(change[0], change[1], outside - body)
 
 
+_INERTIA = PlanarArm(impedance=False)
+
+
 class StaticFit(eqx.Module):
     """What perturbed postures tell of the arm."""
 
@@ -297,7 +298,6 @@ class StaticFit(eqx.Module):
     """All parameters, in the order and units of `PlanarArm`."""
 
 
-@eqx.filter_jit
 def static_inertia(
     movements: Movements, geometry: ArmGeometry, window: float = 0.4, linearised: bool = False
 ) -> StaticFit:
@@ -310,16 +310,23 @@ def static_inertia(
 
     **Source:** Börner et al. 2020, 2.2.3.
     """
+    seen = in_window(movements, _samples(movements, window))
+    return static_fit(seen, geometry, jnp.ones(seen.position.shape[1], bool), jnp.asarray(linearised))
+
+
+@eqx.filter_jit
+def static_fit(
+    seen: Movements, geometry: ArmGeometry, inside: Bool[AnyArray, " S"], linearised: Bool[Array, ""]
+) -> StaticFit:
+    """`static_inertia` from trials that were cut to their window, of the samples `inside` a shorter one."""
     model = PlanarArm((0.0, 0.0))
-    seen = in_window(movements, round(window * movements.sample_rate) + 1)
 
     def normal_equations(trial: Movements) -> tuple[Array, Array]:
         q, dq, ddq = geometry.joint_motion(trial.position, trial.velocity, trial.acceleration)
-        at = model.at(q[0])
-        W = at.regressor(q, dq, ddq)
-        if linearised:
-            still = at.regressor(jnp.broadcast_to(q[0], q.shape), jnp.zeros_like(dq), ddq)
-            W = jnp.concatenate([still[..., :3], W[..., 3:]], axis=-1)
+        # To first order the body is where it was, and does not move.
+        body = jnp.where(linearised, q[0], q), jnp.where(linearised, 0, dq), ddq
+        W = jnp.concatenate([_INERTIA.regressor(*body), model.at(q[0]).regressor(q, dq, ddq)[..., 3:]], axis=-1)
+        W = jnp.where(inside[:, None, None], W, 0)
         torque = geometry.joint_torque(q, trial.force)
         return jnp.einsum("snp,snq->pq", W, W), jnp.einsum("snp,sn->p", W, torque - torque[:1])
 

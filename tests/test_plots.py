@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identify import Estimates, identify_recording
 from jaximp.job import parse_job
+from jaximp.models import ArmGeometry, EndpointImpedance, endpoint_impedance
 from jaximp.plots.style import POINTS, draw_line
 from jaximp.trust import TRUSTED, WEAK, Verdicts
 from jaximp.types import Recording
@@ -171,3 +172,22 @@ def test_envelope_keeps_a_spike() -> None:
 )
 def test_numbers_are_written_for_people(value: float, text: str) -> None:
     assert plots.number(value) == text
+
+
+def test_ellipses_stand_at_the_hand_with_scale_bars() -> None:
+    geometry, q = ArmGeometry((0.29, 0.34)), np.array([0.5, 1.5])
+    xi, D, K = np.array([0.268, 0.084, 0.074]), np.array([[2.4, 1.2], [1.2, 1.4]]), np.array([[29, 14], [14, 17.0]])
+    truth = endpoint_impedance(geometry, q, xi, D, K)
+    unknown = EndpointImpedance(truth.inertia, truth.damping, jnp.full((2, 2), jnp.nan))
+    figure = plots.ellipses(
+        geometry, q, {"one": unknown, "two": endpoint_impedance(geometry, q, xi, D, 1.3 * K)}, truth
+    )
+    assert plots.png(figure).startswith(b"\x89PNG")
+    for label in ("inertia", "damping", "stiffness", " kg", " N s/m", " N/m", "x [m]", "y [m]", "truth", "two"):
+        assert label in words_on(figure)
+    middles = [np.mean(line.get_xydata()[:-1], axis=0) for panel in figure.axes for line in panel.get_lines()[1:4]]
+    known = [middle for middle in middles if np.isfinite(middle).all()]
+    assert len(known) == 8
+    np.testing.assert_allclose(known, np.broadcast_to(geometry.forward(q), (8, 2)), atol=1e-9)
+    nothing = EndpointImpedance(*(jnp.full((2, 2), jnp.nan),) * 3)
+    assert plots.png(plots.ellipses(geometry, q, {"nothing": nothing}))

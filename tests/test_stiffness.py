@@ -181,7 +181,7 @@ def test_a_failed_fit_is_named_and_harms_no_other() -> None:
 
 @cache
 def noisy() -> jax.Array:
-    return residual_triangle(*trials(400, 8, seed=1))
+    return residual_triangle(*trials(256, 8, seed=1))
 
 
 def test_standard_errors_are_those_of_trials() -> None:
@@ -195,7 +195,7 @@ def test_standard_errors_are_those_of_trials() -> None:
         assert (claimed > 0.9).all()
         assert (claimed < 1.3).all()
         inside = np.abs(fit.theta - np.array(truth)) < student.ppf(0.975, fit.dof)[:, None] * fit.stderr
-        np.testing.assert_allclose(inside.mean(axis=0), 0.95, atol=0.04)
+        np.testing.assert_allclose(inside.mean(axis=0), 0.95, atol=0.05)
     # The textbook's, from independent residuals, claim a third of that.
     gram = np.einsum("mtia,mtib->mab", noisy()[..., :4], noisy()[..., :4])
     textbook = np.asarray(linear.residual_rms) * np.sqrt(np.linalg.inv(gram)[:, 2, 2])
@@ -204,7 +204,7 @@ def test_standard_errors_are_those_of_trials() -> None:
 
 def test_standard_errors_on_the_boundary_are_not_too_small() -> None:
     soft = np.array([[29.0, 0.0], [0.0, 0.0]])
-    fit = fit_triangles(residual_triangle(*trials(400, 8, soft, seed=2)), 40)
+    fit = fit_triangles(residual_triangle(*trials(256, 8, soft, seed=2)), 40)
     assert 0.2 < fit.on_boundary.mean() < 0.8
     claimed = np.sqrt((fit.stderr**2).mean(axis=0)) / fit.theta.std(axis=0)
     assert (claimed > 0.9).all()

@@ -5,6 +5,7 @@ between calls, and the settings of a caller's own matplotlib stay as they are. L
 envelopes, so that a million samples cost as much as a few thousand.
 """
 
+from jaximp.plots.arm import ellipses
 from jaximp.plots.design import design
 from jaximp.plots.estimates import (
     condition_over_time,
@@ -25,6 +26,7 @@ __all__ = [
     "design",
     "deviations",
     "effort",
+    "ellipses",
     "impedance_methods",
     "impedance_windows",
     "jerk_spectra",
