@@ -82,12 +82,12 @@ def test_simulate_writes_what_identify_reads(run, tmp_path: Path) -> None:  # ty
     assert {"job.toml", "robot_alone.csv", "robot_with_human.csv"} <= names
 
 
-def test_simulated_arm_is_read_by_its_jobs(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_simulated_arm_is_read_by_its_job(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     numbers = ("--perturbed", 4, "--unperturbed", 2, "--duration", 1.4)
     assert run("simulate", "arm", "--out", tmp_path / "arm", "--format", "csv", *numbers)[0] == 0
-    names = ("job.toml", "posture.toml")
-    movements, postures = (read_job(tmp_path / "arm" / name).trials for name in names)
+    movements = read_job(tmp_path / "arm" / "job.toml").trials
     assert movements is not None
+    postures = movements.posture
     assert postures is not None
     perturbed, unperturbed, _ = movements.load()
     held, none, _ = postures.load()
@@ -99,9 +99,10 @@ def test_simulated_arm_is_read_by_its_jobs(run, tmp_path: Path) -> None:  # type
     assert (np.linalg.eigvalsh(stiffness) > 5).all()
     np.testing.assert_allclose(truth["damping_Nms_per_rad"], stiffness / 12)
     assert len(truth["perturbed_trials"]) == 4
-    status, _, said = run("check", tmp_path / "arm" / "job.toml")
-    assert status == 1
-    assert "this job has [trials]" in said
+    status, said, _ = run("check", tmp_path / "arm" / "job.toml")
+    assert status == 0
+    assert "4 perturbed movements, 2 unperturbed ones\n- the position's noise of" in said
+    assert "20 perturbed postures" in said
 
 
 @pytest.mark.parametrize(
