@@ -20,18 +20,18 @@ from jaximp.isolation import METHODS, Deviations, Impedance, Isolated, JointDevi
 from jaximp.job import parse_job, read_job
 from jaximp.models import ArmGeometry
 from jaximp.movements import Movements
-from jaximp.studies.arm_recordings import write_arm_recordings
 from jaximp.trust import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
 
-NASTY = "<script>alert(1).parquet"
+NASTY = "<script>alert(1).csv"
 FIGURES = {"deviations", "spectra", "torques", "windows", "methods"}
 
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Small simulated recordings with their job."""
-    folder = tmp_path_factory.mktemp("arm")
-    write_arm_recordings(folder, perturbed=10, unperturbed=6, duration=1.4)
+    folder = tmp_path_factory.mktemp("simulated") / "arm"
+    numbers = ("--perturbed", 10, "--unperturbed", 6, "--duration", 1.4)
+    assert jaximp("simulate", "arm", "--out", folder, "--format", "csv", *numbers) == 0
     return folder
 
 
@@ -49,11 +49,29 @@ def jaximp(*arguments: object) -> int:
 def results(arm: Path) -> Path:
     """Of two methods, from a file with a nasty name."""
     text = (arm / "job.toml").read_text()
-    text = text.replace('"feedback_jerk"', '["feedback_jerk", "gomi_kawato"]').replace("movements.parquet", NASTY)
+    text = text.replace('"feedback_jerk"', '["feedback_jerk", "gomi_kawato"]').replace("movements.csv", NASTY)
     (arm / "two.toml").write_text(text + "# <b>bold</b>\n")
-    (arm / NASTY).write_bytes((arm / "movements.parquet").read_bytes())
+    (arm / NASTY).write_bytes((arm / "movements.csv").read_bytes())
     assert jaximp("identify", arm / "two.toml", "--out", arm / "out") == 0
     return arm / "out"
+
+
+def test_simulated_arm_is_read_by_its_job(arm: Path) -> None:
+    job = read_job(arm / "job.toml")
+    assert job.trials is not None
+    assert job.trials.posture is not None
+    perturbed, unperturbed, _ = job.trials.load()
+    held, none, _ = job.trials.posture.load()
+    assert [len(group) for group in (perturbed, unperturbed or [], held)] == [10, 6, 20]
+    assert none is None
+    assert job.trials.methods == ("feedback_jerk",)
+    assert {path.name for path in job.files()} == {"movements.csv", "postures.csv"}
+    truth = json.loads((arm / "truth.json").read_text())
+    assert truth["inertia_kgm2"] == pytest.approx([0.1945, 0.0737, 0.0838])
+    stiffness = np.array(truth["stiffness_Nm_per_rad"])
+    assert (np.linalg.eigvalsh(stiffness) > 5).all()
+    np.testing.assert_allclose(truth["damping_Nms_per_rad"], stiffness / 12)
+    assert len(truth["perturbed_trials"]) == 10
 
 
 def test_simulated_trials_are_identified(results: Path, arm: Path) -> None:
@@ -111,7 +129,7 @@ def test_report_is_self_contained_and_escaped(results: Path) -> None:
     assert page.count('src="data:image/png;base64,') == len(FIGURES)
     assert "&lt;script&gt;alert(1)" in page
     assert "&lt;b&gt;bold" in page
-    assert "a quarter too large" in page
+    assert "16 % too large" in page
 
 
 def test_check_says_what_the_sensors_allow(arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,8 +151,8 @@ BAD_JOBS = {
     "unknown key": ("[trials.posture]", "[trials.posture]\nmethod = 'x'", "[trials.posture] has an unknown key 'met"),
     "long posture": ("[trials.posture]", "[trials.posture]\nwindow = 2", "[trials.posture]: a window of 2 s"),
     "ms": ("[trials.posture]", "[trials.posture]\nwindow = 400", "trials.posture.window is 400 s: were millise"),
-    "no file": ('file = "postures.parquet"', "", "[trials.posture] needs either"),
-    "file is gone": ("postures.parquet", "none.parquet", "none.parquet"),
+    "no file": ('file = "postures.csv"', "", "[trials.posture] needs either"),
+    "file is gone": ("postures.csv", "none.csv", "none.csv"),
     "the movements' command": ("reference = ", "# reference = ", "command1_N"),
     "postures of postures": ("[trials.handle]", "task = 'posture'\n[trials.handle]", "belongs to movements"),
     "long window": ("window = 0.115", "window = 1.5", "1.5"),
@@ -163,7 +181,7 @@ def test_inertia_must_be_known(arm: Path, capsys: pytest.CaptureFixture[str]) ->
     text = (arm / "job.toml").read_text()
     start, end = text.index("[trials.posture]"), text.index("[model.arm]")
     refused(arm, text[:start] + text[end:], "the arm's inertia is not known: add [trials.posture]", capsys)
-    alone = text[:start].replace("movements.parquet", "postures.parquet").replace("command", "reference")
+    alone = text[:start].replace("movements.csv", "postures.csv").replace("command", "reference")
     alone = alone.replace("method =", 'task = "posture"\nmethod =')
     refused(arm, alone + text[end:], "a job of postures alone", capsys)
 
@@ -194,21 +212,10 @@ def test_postures_inherit_columns() -> None:
 
 def read_trials(movements: str, posture: str) -> Any:
     text = "[trials]\nfile = 'm.csv'\ntrial = 'which'\nposition = ['x', 'y']\ntorque = ['fx', 'fy']\n" + movements
-    trials = parse_job(f"{text}[trials.posture]\n{posture}[model.arm]\nlengths = [0.3, 0.3]\n").trials
-    assert trials is not None
-    assert [path.name for path in parse_job(trials_text(text, posture)).files()] == ["m.csv", "p.csv"]
-    return trials.posture
-
-
-def trials_text(text: str, posture: str) -> str:
-    return f"{text}[trials.posture]\n{posture}[model.arm]\nlengths = [0.3, 0.3]\n"
-
-
-def test_methods_stand_side_by_side(arm: Path) -> None:
-    job = read_job(arm / "job.toml")
+    job = parse_job(f"{text}[trials.posture]\n{posture}[model.arm]\nlengths = [0.3, 0.3]\n")
     assert job.trials is not None
-    assert job.trials.methods == ("feedback_jerk",)
-    assert {path.name for path in job.files()} == {"movements.parquet", "postures.parquet"}
+    assert [path.name for path in job.files()] == ["m.csv", "p.csv"]
+    return job.trials.posture
 
 
 # --- verdicts, each on joint deviations that are made for it ----------------------------------------------------------
@@ -234,10 +241,11 @@ def identified(monkeypatch: pytest.MonkeyPatch) -> Identify:
     """Identify made-up joint deviations: D and K of each trial, with noise of a share of the torque."""
 
     def identify(
-        trials: int = 12,
+        trials: int = 10,
         D: np.ndarray = D,
         K: np.ndarray = K,
         noise: float = 0.02,
+        pitch: float = 3.0,
         arm: KnownArm = ARM,
         own: Impedance | None = None,
         linearised: bool = False,
@@ -252,9 +260,9 @@ def identified(monkeypatch: pytest.MonkeyPatch) -> Identify:
         ways = np.broadcast_to(ways[:1], ways.shape) if flat else ways
         displacement = 0.01 * ways * t**2 * (1 - t / 2)
         velocity = 0.01 * ways * (2 * t - 1.5 * t**2) / 0.115
-        torque = np.einsum("...ij,tsj->tsi" if np.ndim(D) == 2 else "tij,tsj->tsi", D, velocity)
-        torque += np.einsum("...ij,tsj->tsi" if np.ndim(K) == 2 else "tij,tsj->tsi", K, displacement)
-        torque += noise * torque.std() * rng.normal(size=(trials, 1, 2)) * np.sin(3 * t)
+        torque = np.einsum("tij,tsj->tsi", np.broadcast_to(D, (trials, 2, 2)), velocity)
+        torque += np.einsum("tij,tsj->tsi", np.broadcast_to(K, (trials, 2, 2)), displacement)
+        torque += noise * torque.std() * rng.normal(size=(trials, 1, 2)) * np.sin(pitch * t)
         joint = JointDeviations(*map(jnp.asarray, (displacement, velocity, torque)))
         zero = jnp.zeros((trials, SAMPLES, 2))
         isolated = Isolated(Deviations(zero, zero, zero, zero), impedance=own)
@@ -270,7 +278,7 @@ def identified(monkeypatch: pytest.MonkeyPatch) -> Identify:
 def test_good_trials_are_trusted(identified: Identify) -> None:
     found = identified(notes=("a note", "a note"))
     assert (found.verdict, found.reason, found.warnings, found.notes) == (TRUSTED, "", (), ("a note",))
-    np.testing.assert_allclose(found.D, D, atol=0.05)
+    np.testing.assert_allclose(found.D, D, atol=0.1)
     np.testing.assert_allclose(found.K, K, atol=2)
     assert found.names == ("D11", "D12", "D21", "D22", "K11", "K12", "K22")
     assert identified(linearised=True).names == ("D11", "D12", "D21", "D22", "K11", "K12", "K21", "K22")
@@ -291,7 +299,7 @@ def test_errors_of_the_inertia_widen_the_interval(arm: Path) -> None:
     assert several[1][4, 4] > 1.05 * several[0][4, 4]
 
 
-def of_trials(matrix: np.ndarray, spread: float, trials: int = 12) -> np.ndarray:
+def of_trials(matrix: np.ndarray, spread: float, trials: int = 10) -> np.ndarray:
     """A matrix for each trial, alternately larger and smaller."""
     return matrix * (1 + spread * np.where(np.arange(trials) % 2, 1, -1))[:, None, None]
 
@@ -312,7 +320,11 @@ CASES: dict[str, tuple[dict[str, Any], str, str]] = {
     "indefinite": ({"K": INDEFINITE}, POOR, r"indefinite stiffness \(an eigenvalue of -[0-9.]+ N m/rad\)"),
     "indefinite, free": ({"K": INDEFINITE, "linearised": True}, POOR, "indefinite stiffness"),
     "driving": ({"D": D - 2.0 * np.eye(2)}, POOR, "damping is not positive definite: an eigenvalue of -"),
-    "unexplained": ({"noise": 0.8, "limits": LOOSE}, POOR, "explain [0-9]+% of the isolated torque, less than 75%"),
+    "unexplained": (
+        {"noise": 1.0, "pitch": 60.0, "limits": LOOSE},
+        POOR,
+        "explain [0-9]+% of the isolated torque, less than 75%",
+    ),
     "no body": (
         {"arm": KnownArm(GEOMETRY, np.array([0.01, 0.0737, 0.0838]), inertia_stderr=np.full(3, 1e-4))},
         POOR,
@@ -357,9 +369,9 @@ def test_warnings_leave_the_verdict(identified: Identify) -> None:
 
 def test_a_method_of_its_own_has_no_other_windows(identified: Identify) -> None:
     identified(own=own())
-    assert at_other_windows(movements(12), None, ARM, "made_up", 0.05) is None
+    assert at_other_windows(movements(10), None, ARM, "made_up", 0.05) is None
 
 
 def test_unknown_methods_are_named() -> None:
-    with pytest.raises(ValueError, match=r"there is no method 'gomi': did you mean 'gomi_kawato'"):
-        identify_impedance(movements(5), None, ARM, "gomi")
+    with pytest.raises(ValueError, match=r"there is no method 'gomi_kavato': did you mean 'gomi_kawato'"):
+        identify_impedance(movements(5), None, ARM, "gomi_kavato")
