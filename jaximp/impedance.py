@@ -396,11 +396,15 @@ def _error_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             not all(share <= limits.max_relative_stderr for share in shares.values()),
             WEAK,
             lambda: (
-                f"the standard error of {name} is {shares[name]:.0%} of the size of the {MATRICES[name[0]]}, above "
-                f"{limits.max_relative_stderr:.0%}: perturb more movements, or harder, or know the inertia better"
+                f"the standard error of {name} is {_percent(shares[name])} of the size of the {MATRICES[name[0]]}, above "
+                f"{_percent(limits.max_relative_stderr)}: perturb more movements, or harder, or know the inertia better"
             ),
         )
     ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
 
 
 def relative_stderr(result: ArmImpedance) -> dict[str, float]:
@@ -468,8 +472,8 @@ def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             not result.explained >= limits.min_vaf,
             POOR,
             lambda: (
-                f"damping and stiffness explain {result.explained:.0%} of the isolated torque, less than "
-                f"{limits.min_vaf:.0%}: check onsets, inertia, lengths of the arm and the handle's mass, or shorten "
+                f"damping and stiffness explain {_percent(result.explained)} of the isolated torque, less than "
+                f"{_percent(limits.min_vaf)}: check onsets, inertia, lengths of the arm and the handle's mass, or shorten "
                 "the window"
             ),
         ),
@@ -477,8 +481,8 @@ def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             tried and not result.held_out >= limits.min_vaf,
             POOR,
             lambda: (
-                f"half of the trials predicts {result.held_out:.0%} of the torque of the others, less than "
-                f"{limits.min_vaf:.0%}: the trials contradict each other; leave out those that went wrong, or record "
+                f"half of the trials predicts {_percent(result.held_out)} of the torque of the others, less than "
+                f"{_percent(limits.min_vaf)}: the trials contradict each other; leave out those that went wrong, or record "
                 "more"
             ),
         ),
@@ -523,7 +527,7 @@ def _asymmetry(result: ArmImpedance, limits: TrustLimits) -> list[str]:
     if not stiffness.surely_asymmetric(limits)[0]:
         return []
     return [
-        f"the stiffness is not symmetric: its antisymmetric part is {stiffness.asymmetry[0]:.0%} of the symmetric one, "
+        f"the stiffness is not symmetric: its antisymmetric part is {_percent(stiffness.asymmetry[0])} of the symmetric one, "
         "as muscles alone do not make it"
     ]
 

@@ -316,14 +316,14 @@ CASES: dict[str, tuple[dict[str, Any], str, str]] = {
     "co-linear": ({"flat": True}, WEAK, "there is no estimate: velocities and displacements are co-linear"),
     "not finite": ({"K": K * np.nan}, NO_DATA, "a number is not finite: look for gaps"),
     "few trials": ({"trials": 4}, WEAK, "cannot be judged: 4 perturbed trials are too few"),
-    "loud": ({"noise": 3.0}, WEAK, "is [0-9]+% of the size of the (stiffness|damping), above 20%: perturb more"),
+    "loud": ({"noise": 3.0}, WEAK, "is [0-9.]+ % of the size of the (stiffness|damping), above 20 %: perturb more"),
     "indefinite": ({"K": INDEFINITE}, POOR, r"indefinite stiffness \(an eigenvalue of -[0-9.]+ N m/rad\)"),
     "indefinite, free": ({"K": INDEFINITE, "linearised": True}, POOR, "indefinite stiffness"),
     "driving": ({"D": D - 2.0 * np.eye(2)}, POOR, "damping is not positive definite: an eigenvalue of -"),
     "unexplained": (
         {"noise": 1.0, "pitch": 60.0, "limits": LOOSE},
         POOR,
-        "explain [0-9]+% of the isolated torque, less than 75%",
+        "explain [0-9.]+ % of the isolated torque, less than 75 %",
     ),
     "no body": (
         {"arm": KnownArm(GEOMETRY, np.array([0.01, 0.0737, 0.0838]), inertia_stderr=np.full(3, 1e-4))},
