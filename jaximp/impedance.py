@@ -396,8 +396,9 @@ def _error_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             not all(share <= limits.max_relative_stderr for share in shares.values()),
             WEAK,
             lambda: (
-                f"the standard error of {name} is {_percent(shares[name])} of the size of the {MATRICES[name[0]]}, above "
-                f"{_percent(limits.max_relative_stderr)}: perturb more movements, or harder, or know the inertia better"
+                f"the standard error of {name} is {_percent(shares[name])} of the size of the {MATRICES[name[0]]}, "
+                f"above {_percent(limits.max_relative_stderr)}: perturb more movements, or harder, or know the "
+                "inertia better"
             ),
         )
     ]
@@ -473,8 +474,8 @@ def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             POOR,
             lambda: (
                 f"damping and stiffness explain {_percent(result.explained)} of the isolated torque, less than "
-                f"{_percent(limits.min_vaf)}: check onsets, inertia, lengths of the arm and the handle's mass, or shorten "
-                "the window"
+                f"{_percent(limits.min_vaf)}: check onsets, inertia, lengths of the arm and the handle's "
+                "mass, or shorten the window"
             ),
         ),
         (
@@ -482,8 +483,8 @@ def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             POOR,
             lambda: (
                 f"half of the trials predicts {_percent(result.held_out)} of the torque of the others, less than "
-                f"{_percent(limits.min_vaf)}: the trials contradict each other; leave out those that went wrong, or record "
-                "more"
+                f"{_percent(limits.min_vaf)}: the trials contradict each other; leave out those that went wrong, "
+                "or record more"
             ),
         ),
     ]
@@ -527,8 +528,8 @@ def _asymmetry(result: ArmImpedance, limits: TrustLimits) -> list[str]:
     if not stiffness.surely_asymmetric(limits)[0]:
         return []
     return [
-        f"the stiffness is not symmetric: its antisymmetric part is {_percent(stiffness.asymmetry[0])} of the symmetric one, "
-        "as muscles alone do not make it"
+        f"the stiffness is not symmetric: its antisymmetric part is {_percent(stiffness.asymmetry[0])} of the symmetric "
+        "one, as muscles alone do not make it"
     ]
 
 
