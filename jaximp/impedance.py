@@ -528,8 +528,8 @@ def _asymmetry(result: ArmImpedance, limits: TrustLimits) -> list[str]:
     if not stiffness.surely_asymmetric(limits)[0]:
         return []
     return [
-        f"the stiffness is not symmetric: its antisymmetric part is {_percent(stiffness.asymmetry[0])} of the symmetric "
-        "one, as muscles alone do not make it"
+        f"the stiffness is not symmetric: its antisymmetric part is {_percent(stiffness.asymmetry[0])} of the "
+        "symmetric one, as muscles alone do not make it"
     ]
 
 
