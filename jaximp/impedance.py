@@ -113,7 +113,8 @@ class ArmImpedance:
     on_boundary: bool
     """The stiffness is singular, since the data ask for an indefinite one."""
     explained: float
-    """Share of the isolated joint torques that damping and stiffness explain."""
+    """Share of the isolated joint torques that damping and stiffness explain. (Of a method that estimates the impedance
+    itself it is no measure: it need not know the acceleration well, and the `misfit` tells.)"""
     held_out: float
     """Share of the torques that is predicted from the other half of the trials; NaN where it was not tried."""
     misfit: float | None
@@ -201,11 +202,12 @@ def identify_impedance(
     check_method(method)
     found = isolate(perturbed, unperturbed, arm, method, window, cutoff)
     way = METHODS[method]
-    joint, moved = _joint_deviations(perturbed, found.deviations, arm, way.linearised)
+    own = found.impedance
+    body = arm if own is None else KnownArm(arm.geometry, own.inertia, arm.handle, arm.inertia_stderr)
+    joint, moved = _joint_deviations(perturbed, found.deviations, body, way.linearised)
     samples = joint.torque.shape[-2]
     triangles = _triangles(joint, moved)
     fit = _fitted(triangles, samples, way.linearised)
-    own = found.impedance
     why, on_boundary, held_out, misfit = fit.why, fit.on_boundary, fit.held_out, None
     D, K, covariance, dof = fit.D, fit.K, fit.covariance, fit.dof
     if own is not None:
@@ -458,7 +460,7 @@ def criteria(result: ArmImpedance, which: str) -> MatrixCriteria:
 
 
 def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
-    """How much of the torque is told."""
+    """How much of the torque is told; of a method that estimates the impedance itself, its misfit."""
     tried = result.misfit is None
     return [
         (
@@ -470,7 +472,7 @@ def _share_rules(result: ArmImpedance, limits: TrustLimits) -> list[Rule]:
             ),
         ),
         (
-            not result.explained >= limits.min_vaf,
+            tried and not result.explained >= limits.min_vaf,
             POOR,
             lambda: (
                 f"damping and stiffness explain {_percent(result.explained)} of the isolated torque, less than "

@@ -17,12 +17,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Bool, Float, Integer, Num
 from scipy.fft import next_fast_len
 
 from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
-from jaximp.movements import Handle, Movements
+from jaximp.movements import Deviations, Handle, Movements
 from jaximp.objectives import solve_gram
+from jaximp.output_error import output_error
 from jaximp.signals import butterworth, central_differences, filter_zero_phase
 from jaximp.trajectories import array_field
 from jaximp.types import AnyArray, Numbers
@@ -54,31 +55,20 @@ class KnownArm(eqx.Module):
         return lakatos_from_borner(jnp.asarray(self.inertia))
 
 
-class Deviations(eqx.Module):
-    """Unperturbed less perturbed, from the onset on; the first sample is that of the onset."""
-
-    position: Float[Array, "*T S 2"]
-    """Of the hand [m]."""
-    velocity: Float[Array, "*T S 2"]
-    """[m/s]"""
-    acceleration: Float[Array, "*T S 2"]
-    """[m/s^2]"""
-    force: Float[Array, "*T S 2"]
-    """Of the handle on the hand [N]."""
-
-
 class Impedance(eqx.Module):
-    """Damping and stiffness of the joints, from a method that estimates them itself."""
+    """Damping and stiffness of the joints, from a method that estimates them itself; of groups of trials, if asked."""
 
-    D: Float[Array, "2 2"]
+    D: Float[Array, "*G 2 2"]
     """[N m s/rad]"""
-    K: Float[Array, "2 2"]
+    K: Float[Array, "*G 2 2"]
     """Symmetric [N m/rad]."""
-    covariance: Float[Array, "7 7"]
+    covariance: Float[Array, "*G 7 7"]
     """Of D11, D12, D21, D22, K11, K12, K22."""
-    dof: Float[Array, ""]
+    inertia: Float[Array, "*G 3"]
+    """Base inertial parameters of eq. (12), as the method improves them [kg m^2]."""
+    dof: Float[Array, "*G"]
     """Degrees of freedom: a quantile of Student's t with so many makes the intervals."""
-    misfit: Float[Array, ""]
+    misfit: Float[Array, "*G"]
     """Mean square of the residuals over what was expected: far above one, something is wrong."""
 
 
@@ -230,6 +220,33 @@ def state_at_onset(
     )
 
 
+def learned_continuation(
+    perturbed: Movements,
+    unperturbed: Movements | None,
+    arm: KnownArm,
+    window: float = VOLUNTARY_DELAY,
+    groups: Integer[AnyArray, "G m"] | None = None,
+) -> Isolated:
+    """The unperturbed movement is how unperturbed trials teach that this one goes on, the deviation is simulated, and
+    the impedance is that for which both meet the measured movement: `output_error`.
+
+    **Arguments:** `groups` (G, m) indices of the perturbed trials of each estimate; without it, one of all of them.
+
+    **Raises:** `ValueError` without unperturbed trials, and as `output_error`.
+    """
+    if unperturbed is None:
+        raise ValueError(
+            "output error learns from unperturbed trials how the movement goes on, and there are none: record some "
+            "(30 or more), or use gomi_kawato"
+        )
+    fit = output_error(
+        perturbed, unperturbed, arm.geometry, arm.handle, arm.inertia, arm.inertia_stderr, window=window, groups=groups
+    )
+    of_both, dof = fit.covariance[..., :7, :7], fit.dof[..., :7].min(axis=-1)
+    found = (jnp.asarray(x) for x in (fit.D, fit.K, of_both, fit.inertia, dof, fit.chi2))
+    return Isolated(fit.deviations, impedance=Impedance(*found))
+
+
 def _samples(movements: Movements, window: float) -> int:
     """In a window that begins with the onset and has both of its ends.
 
@@ -353,9 +370,12 @@ class Method(NamedTuple):
     """Whether its authors take the inertia to first order, and leave the stiffness asymmetric."""
     smooth: bool = True
     """Whether it wants position and force smoothed as the derivatives are (`read_movements`), or as measured."""
+    estimates: bool = False
+    """Whether it estimates the impedance itself, of `groups` of trials."""
 
 
 METHODS = {
+    "output_error": Method("OE", "output error (this project)", learned_continuation, smooth=False, estimates=True),
     "feedback_jerk": Method("FJI", "feedback jerk isolation (Börner et al. 2020)", feedback_jerk_isolation),
     "gomi_kawato": Method("GOM", "mean of all perturbed trials (Gomi and Kawato 1997)", mean_of_perturbed, True),
     "erden_billard": Method("ERD", "state at the onset (Erden and Billard 2015)", state_at_onset),

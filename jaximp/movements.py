@@ -54,3 +54,16 @@ class Movements(eqx.Module):
 
     def __len__(self) -> int:
         return self.position.shape[0]
+
+
+class Deviations(eqx.Module):
+    """Unperturbed less perturbed, from the onset on; the first sample is that of the onset."""
+
+    position: Float[Array, "*T S 2"]
+    """Of the hand [m]."""
+    velocity: Float[Array, "*T S 2"]
+    """[m/s]"""
+    acceleration: Float[Array, "*T S 2"]
+    """[m/s^2]"""
+    force: Float[Array, "*T S 2"]
+    """Of the handle on the hand [N]."""

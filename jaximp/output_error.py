@@ -45,7 +45,10 @@ linear course is its mean). Groups of one experiment share prior and inertia: th
 
 **Limits.** All numbers of this project for it are from a simulation whose arm is the fitted model: rigid, linear in the
 window, noise that ends steeply at 2 Hz, no soft tissue, no drift, no fatigue, and the commanded force is really
-applied. `chi2` tells wrong timing, calibration or noise level if they are gross; that it is low proves nothing.
+applied; it is integrated by the method and the step of the fit. There 95 % intervals hold K in 93 to 99 % of groups of
+20 trials in movements of 2 and 3 s, but K11 in 84 % at 1 s, where the stiffness bends within the window, and in 75 to
+90 % with 10 unperturbed trials or a noisy position. `chi2` tells timing, calibration or noise level that are grossly
+wrong; that it is low proves nothing: a command 1 % too large biases D by 3 % and is not noticed.
 """
 
 from __future__ import annotations
@@ -57,10 +60,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
+from scipy.interpolate import CubicSpline
 from scipy.stats import t as student
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
-from jaximp.movements import Handle, Movements
+from jaximp.movements import Deviations, Handle, Movements
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray, Numbers
 
@@ -107,19 +111,6 @@ PAIRS = np.array([0, 1, 1, 2])
 KAPPA, INERTIA, DELAY = slice(7, 14), slice(14, 17), 17
 
 
-class Deviations(eqx.Module):
-    """Unperturbed less perturbed, at full rate from the onset on; the first sample is that of the onset."""
-
-    position: Float[Array, "T S 2"]
-    """Of the hand [m]."""
-    velocity: Float[Array, "T S 2"]
-    """[m/s]"""
-    acceleration: Float[Array, "T S 2"]
-    """[m/s^2]"""
-    force: Float[Array, "T S 2"]
-    """Of the handle on the hand [N]."""
-
-
 class OutputErrorFit(eqx.Module):
     """Impedance of groups of trials; one group has no leading axis."""
 
@@ -138,7 +129,8 @@ class OutputErrorFit(eqx.Module):
     dof: Float[Any, "*G 18"]
     """Degrees of freedom for Student's t: how well the unperturbed trials tell the variance."""
     chi2: Float[Any, "*G"]
-    """Weighted sum of squares of the residuals over what is expected of it: about 1."""
+    """Weighted sum of squares of the residuals over what is expected of it: about 1, or less where trials differ less
+    than `SPREAD` allows."""
     ok: Bool[Any, "*G"]
     """Whether the iteration came to rest, all is finite and chi2 is at most `MISFIT`."""
     residual: Float[Any, "T B 2"]
@@ -203,7 +195,7 @@ def output_error(
     for _ in range(ITERATIONS):
         linear = _Linear.of(theta, target, lanes, geometry, handle, prior)
         step = linear.solve(np.arange(len(perturbed)), known)
-        theta = step.theta
+        theta = known.within(step.theta)
         rest = bool((np.abs(theta - linear.theta)[:7] < SMALL_STEP * np.sqrt(np.diag(step.covariance))[:7]).all())
         if rest:
             break
@@ -370,14 +362,14 @@ def _in_lanes(perturbed: Movements, geometry: ArmGeometry, handle: Handle, bins:
     room = int(np.ceil(DELAYS * rate))
 
     def cut(x: Any, first: int, last: int) -> Numbers:
-        """(S, 2, T), with new samples between the old on straight lines."""
+        """(S, 2, T), with new samples between the old by a cubic spline."""
         x = np.asarray(x)
         samples = np.clip(onset[:, None] + np.arange(first, last + 1), 0, x.shape[1] - 1)
         x = np.moveaxis(x[np.arange(len(x))[:, None], samples], 0, -1)
-        at = np.arange((len(x) - 1) * finer + 1) / finer
-        whole = np.minimum(at.astype(int), len(x) - 2)
-        part = (at - whole)[:, None, None]
-        return (1 - part) * x[whole] + part * x[whole + 1]
+        if finer == 1:
+            return x
+        at = np.arange(len(x))
+        return CubicSpline(at, x)(np.arange((len(x) - 1) * finer + 1) / finer)
 
     end = bins.after * bins.width
     motion = [_last(cut(x, 0, end)) for x in (perturbed.position, perturbed.velocity, perturbed.acceleration)]
@@ -507,6 +499,14 @@ class _Known(NamedTuple):
         P = np.zeros((18, 18))
         P[KAPPA, KAPPA], P[INERTIA, INERTIA] = np.linalg.inv(trend), np.diag(sd**-2.0)
         return cls(np.concatenate([START, np.zeros(7), pi, [0.0]]), P)
+
+    def within(self, theta: Numbers) -> Numbers:
+        """Where the arm can be simulated: trials that no impedance explains lead the iteration anywhere."""
+        limit = np.full(18, np.inf)
+        limit[:7], limit[KAPPA], limit[DELAY] = 10 * self.start[:7], 2.0, 0.9 * DELAYS
+        low, high = -limit, limit
+        low[INERTIA], high[INERTIA] = self.start[INERTIA] / 2, 2 * self.start[INERTIA]
+        return np.clip(theta, low, high)
 
 
 class _Step(NamedTuple):

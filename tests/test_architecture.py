@@ -32,7 +32,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("chunks", "stiffness"),
     ("least_squares", "objectives", "definite"),
     ("engine",),
-    ("simulation", "bounds", "movement_trials"),
+    ("simulation", "bounds", "movement_trials", "output_error"),
     ("models", "movements"),
     ("recordings", "trajectories"),
     ("signals", "readers", "settings", "optimise"),

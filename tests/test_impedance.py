@@ -143,7 +143,6 @@ def test_check_says_what_the_sensors_allow(arm: Path, capsys: pytest.CaptureFixt
 
 POSTURE = "[trials.posture]                              # for the inertia: the arm keeps a posture"
 BAD_JOBS = {
-    "a method to come": ('"feedback_jerk"', '"output_error"', "'output_error' is not in this version yet"),
     "no such method": ('"feedback_jerk"', '"feedback"', "did you mean 'feedback_jerk'"),
     "no method": ('"feedback_jerk"', "[]", "name at least one"),
     "one twice": ('"feedback_jerk"', '["gomi_kawato", "gomi_kawato"]', "each once"),
@@ -307,7 +306,7 @@ def of_trials(matrix: np.ndarray, spread: float, trials: int = 10) -> np.ndarray
 def own(D: np.ndarray = D, K: np.ndarray = K, error: float = 0.02, dof: float = 30.0, misfit: float = 1.0) -> Impedance:
     """What a method of its own says."""
     sizes = np.array([2.4] * 4 + [29.0] * 3)
-    return Impedance(*map(jnp.asarray, (D, K, np.diag((error * sizes) ** 2), dof, misfit)))
+    return Impedance(*map(jnp.asarray, (D, K, np.diag((error * sizes) ** 2), ARM.inertia, dof, misfit)))
 
 
 LOOSE = TrustLimits(max_relative_stderr=100.0)
