@@ -3,6 +3,8 @@
 from jaximp import models
 from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.identify import Estimates, identify, identify_recording
+from jaximp.impedance import ArmImpedance, identify_impedance, identify_trials
+from jaximp.isolation import KnownArm
 from jaximp.job import FilterSettings, Job, parse_job, read_job
 from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
 from jaximp.movement_trials import judge_sensors, read_movements, read_postures
@@ -33,6 +35,7 @@ from jaximp.types import Recording
 from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
 __all__ = [
+    "ArmImpedance",
     "Design",
     "Encoder",
     "Estimates",
@@ -40,6 +43,7 @@ __all__ = [
     "FourierSeries",
     "Handle",
     "Job",
+    "KnownArm",
     "Limits",
     "LinearFit",
     "MinimumJerk",
@@ -65,7 +69,9 @@ __all__ = [
     "fit_triangles",
     "fit_triangles_linear",
     "identify",
+    "identify_impedance",
     "identify_recording",
+    "identify_trials",
     "jerk",
     "joint_trials",
     "judge_sensors",

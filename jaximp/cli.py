@@ -20,6 +20,7 @@ from jaximp.types import Progress
 
 if TYPE_CHECKING:  # what a command needs is imported when it runs: `--help` must not wait for it
     from jaximp.identify import Estimates
+    from jaximp.impedance import ArmImpedance
     from jaximp.job import Job
 
 app = typer.Typer(
@@ -94,9 +95,10 @@ def prepare() -> None:
 
 @app.command()
 def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
-    """Estimate the parameters in every window of a recording.
+    """Estimate the parameters in every window of a recording, or the impedance of an arm from perturbation trials.
 
-    Writes estimates.parquet (one row per window), summary.json, report.html and the figures into the folder.
+    Writes estimates.parquet (one row per window, or one per method), summary.json, report.html and the figures into
+    the folder.
     """
     from jaximp.job import read_job
     from jaximp.outputs import new_folder
@@ -130,12 +132,16 @@ def demo(
 def check(job_file: JobFile) -> None:
     """Look at a recording before a run: sampling, gaps, saturation, noise, delay, excitation.
 
-    Proposes cut-off frequencies and a window for the job file.
+    Proposes cut-off frequencies and a window for the job file. Of perturbation trials it says how many there are, and
+    what the sensors allow.
     """
     from jaximp.check import check_recording
     from jaximp.job import read_job
 
     job = read_job(job_file)
+    if job.trials is not None:
+        _check_trials(job)
+        return
     with _progress("checking") as progress:
         findings, proposal = check_recording(job, job.load(), job.load_robot_alone(), progress)
     table = Table("", "checked", "found", box=None, pad_edge=False)
@@ -222,6 +228,9 @@ def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
 
 
 def _identify_into(job: Job, folder: Path) -> None:
+    if job.trials is not None:
+        _identify_trials_into(job, folder)
+        return
     from jaximp.identify import at_other_lengths, in_windows, prepare
 
     # Figures take long to import: that is done while the other core compiles.
@@ -238,6 +247,42 @@ def _identify_into(job: Job, folder: Path) -> None:
         write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
         progress(1.0)
     _say_result(estimates[0])
+
+
+def _identify_trials_into(job: Job, folder: Path) -> None:
+    from jaximp.impedance import identify_trials
+
+    Thread(target=import_module, args=("jaximp.impedance_report",)).start()
+    with _progress("identifying") as progress:
+        result = identify_trials(job, lambda share: progress(0.8 * share))
+        from jaximp.impedance_report import write_trials_results
+
+        write_trials_results(folder, result, job)
+        progress(1.0)
+    for estimate in result.estimates:
+        _say_impedance(estimate)
+    for note in result.main.notes:
+        typer.echo(f"note: {note}")
+
+
+def _say_impedance(found: ArmImpedance) -> None:
+    typer.echo(f"{found.title}: {found.trials} perturbed trials, {1e3 * found.window:g} ms after the onset")
+    for name, unit, value, stderr in zip(found.names, found.units, found.theta, found.stderr, strict=True):
+        typer.echo(f"{name:>20} {value:11.4g} ({stderr:.2g}) {unit}")
+    typer.echo(f"verdict: {found.verdict}" + (f": {found.reason}" if found.reason else ""))
+    for warning in found.warnings:
+        typer.echo(f"warning: {warning}")
+
+
+def _check_trials(job: Job) -> None:
+    """How many trials were read, and what reading says of them."""
+    for table in job.tables_of_trials():
+        perturbed, unperturbed, notes = table.load()
+        kind = "perturbed postures" if table.task == "posture" else "perturbed movements"
+        others = 0 if unperturbed is None else len(unperturbed)
+        typer.echo(f"{len(perturbed)} {kind}" + (f", {others} unperturbed ones" if table.task != "posture" else ""))
+        for note in notes:
+            typer.echo(f"- {note}")
 
 
 def _say_result(estimates: Estimates) -> None:

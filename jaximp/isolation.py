@@ -105,7 +105,7 @@ def jerk(movements: Movements) -> Float[Array, "T N 2"]:
 def energy_spectra(perturbed: Movements, unperturbed: Movements) -> tuple[Numbers, Numbers, Numbers]:
     """Mean energy spectral densities of the jerk, eq. (24), with the feedback's as what perturbed trials have more.
 
-    **Returns:** frequencies (F,) up to 50 Hz, and densities (F, 2) of unperturbed and perturbed trials [m^2/s^4/Hz^2].
+    **Returns:** frequencies (F,) up to 50 Hz, and densities (F, 2) of unperturbed and perturbed trials [m^2/s^4].
     """
     rate = perturbed.sample_rate
     # Means of short blocks say all that there is to say of frequencies so low.
@@ -248,7 +248,10 @@ def learned_continuation(
 
 
 def _samples(movements: Movements, window: float) -> int:
-    """In a window that begins with the onset and has both of its ends."""
+    """In a window that begins with the onset and has both of its ends.
+
+    **Raises:** `ValueError` for a window that is longer than a trial lasts after its onset.
+    """
     samples = round(window * movements.sample_rate) + 1
     left = movements.position.shape[-2] - int(np.max(np.asarray(movements.onset)))
     if samples > left:
@@ -365,12 +368,14 @@ class Method(NamedTuple):
     isolate: Callable[..., Isolated]
     linearised: bool = False
     """Whether its authors take the inertia to first order, and leave the stiffness asymmetric."""
+    smooth: bool = True
+    """Whether it wants position and force smoothed as the derivatives are (`read_movements`), or as measured."""
     estimates: bool = False
     """Whether it estimates the impedance itself, of `groups` of trials."""
 
 
 METHODS = {
-    "output_error": Method("OE", "output error (this project)", learned_continuation, estimates=True),
+    "output_error": Method("OE", "output error (this project)", learned_continuation, smooth=False, estimates=True),
     "feedback_jerk": Method("FJI", "feedback jerk isolation (Börner et al. 2020)", feedback_jerk_isolation),
     "gomi_kawato": Method("GOM", "mean of all perturbed trials (Gomi and Kawato 1997)", mean_of_perturbed, True),
     "erden_billard": Method("ERD", "state at the onset (Erden and Billard 2015)", state_at_onset),

@@ -164,8 +164,13 @@ class Job:
         """What the job reads."""
         tables = (self.recording, self.robot_recording or {})
         names = [str(table["file"]) for table in tables if "file" in table]
-        trials = [] if self.trials is None else self.trials.paths()
+        trials = [path for table in self.tables_of_trials() for path in table.paths()]
         return [*(self.folder / name for name in (*names, self.design) if name is not None), *trials]
+
+    def tables_of_trials(self) -> list[TrialsSettings]:
+        """`[trials]` and `[trials.posture]`, as far as the job has them."""
+        tables = (self.trials, self.trials and self.trials.posture)
+        return [table for table in tables if table is not None]
 
     def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
@@ -237,6 +242,8 @@ def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
     check_keys(model, ["arm"], "[model] beside [trials]")
     arm = arm_settings(model["arm"])
     trials = trials_settings(tables["trials"], folder, arm.geometry())
+    if arm.inertia is not None and trials.posture is not None:
+        raise ValueError("model.arm.inertia and [trials.posture] both give the arm's inertia: keep one of them")
     trust = settings(TrustLimits, tables.get("trust", {}), "trust")
     _check_limits(trust)
     window = WindowSettings(trials.window)

@@ -594,14 +594,21 @@ def _check_kept(before: float | None, after: float | None, window: float) -> Non
             raise ValueError(f"{name} is {given:g} s: at least {low:.3g} s are needed")
 
 
+def window_warning(window: float) -> str:
+    """What is to be said of a window [s] that is longer than a subject needs to answer; empty of others."""
+    if window <= VOLUNTARY_DELAY + 1e-9:
+        return ""
+    return (
+        f"the window of {1e3 * window:.4g} ms is longer than the voluntary delay of {1e3 * VOLUNTARY_DELAY:g} ms: "
+        "the estimates are those of an arm that may already answer at will"
+    )
+
+
 def _notes(trials: list[_Trial], window: float) -> tuple[str, ...]:
     """What the user should know, in plain words."""
     notes = []
-    if window > VOLUNTARY_DELAY + 1e-9:
-        notes.append(
-            f"the window of {1e3 * window:.4g} ms is longer than the voluntary delay of {1e3 * VOLUNTARY_DELAY:g} ms: "
-            "the estimates are those of an arm that may already answer at will"
-        )
+    if too_long := window_warning(window):
+        notes.append(too_long)
     if all(trial.perturbed for trial in trials):
         notes.append(
             "no trial is unperturbed: what the perturbations change is not known by comparison; record unperturbed "

@@ -5,18 +5,13 @@ The report gives the answer first and never a number that no trusted window stan
 
 from __future__ import annotations
 
-import base64
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
-from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import jinja2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -27,6 +22,7 @@ from jaximp.identify import Estimates
 from jaximp.job import Job
 from jaximp.least_squares import confidence_interval
 from jaximp.models import HumanJoint, Joints, Model
+from jaximp.pages import inline, percent, table_of, template, versions, without_nan, write_figures, write_summary
 from jaximp.payload import METHODS
 from jaximp.regression import design_filters
 from jaximp.trust import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK
@@ -82,11 +78,9 @@ def write_results(
         name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
         pq.write_table(estimates_table(estimates, human, job), folder / f"{name}.parquet")
     figures = draw_figures(estimates_list, lengths)
-    for name, image in figures.items():
-        (folder / f"{name}.png").write_bytes(image)
+    write_figures(folder, figures)
     content = summary(estimates_list, job, recording, lengths)
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    write_summary(folder, content)
     write_report(folder / "report.html", estimates_list, lengths, job, recording, figures)
 
 
@@ -126,15 +120,12 @@ def write_report(
         for name in VERDICTS
         if found[name]["count"]
     ]
-    inline = [
-        (name, base64.b64encode(images[name]).decode(), caption) for name, caption in CAPTIONS.items() if name in images
-    ]
-    page = _template().render(
+    page = template("report.jinja").render(
         content=content,
         verdicts=verdicts,
         notes=_notes(content),
         main=plots.main_parameter(estimates_list[0].names),
-        figures=inline,
+        figures=inline(images, CAPTIONS),
         settings=_settings(content),
     )
     Path(path).write_text(page, encoding="utf-8")
@@ -166,12 +157,10 @@ def summary(
         "filters": asdict(job.filter) | {"decimate": design_filters(job.filter, recording.sample_rate).decimate},
         "trust_limits": asdict(job.trust),
         "min_velocity": job.window.min_velocity,
-        "versions": {name: metadata.version(name) for name in ("jaximp", "jax", "numpy")},
+        "versions": versions(),
         "job": job.text,
     }
-    plain = _without_nan(content)
-    assert isinstance(plain, dict)
-    return plain
+    return without_nan(content)
 
 
 def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | None = None) -> pa.Table:
@@ -201,13 +190,7 @@ def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | 
         ("verdict", "", estimates.verdicts.verdict),
         ("reason", "", estimates.verdicts.reason),
     ]
-    arrays = [pa.array(np.asarray(values)) for _, _, values in columns]
-    fields = [
-        pa.field(name, array.type, metadata={"unit": unit})
-        for (name, unit, _), array in zip(columns, arrays, strict=True)
-    ]
-    about = {"jaximp_version": metadata.version("jaximp"), "job": "" if job is None else job.text}
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
+    return table_of(columns, "" if job is None else job.text)
 
 
 @dataclass(frozen=True)
@@ -358,7 +341,7 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
     threshold, step = content["threshold"], content["step_s"]
     speed = "m/s" if set(recording["joints"]) == {"prismatic"} else "rad/s"
     return {
-        "recording": f"{recording['samples']} samples, {_percent(recording['valid_share'])} of them valid",
+        "recording": f"{recording['samples']} samples, {percent(recording['valid_share'])} of them valid",
         "sample rate": f"{recording['sample_rate_hz']:.6g} Hz",
         "joints": ", ".join(recording["joints"]),
         "low-pass of the position": cutoff("position_cutoff", "position_order"),
@@ -371,8 +354,8 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "slowest motion that counts": f"{content['min_velocity']:g} {speed}" if content["min_velocity"] else "any",
         "threshold on the condition number": "none" if threshold is None else f"{threshold:.4g}",
         "to be trusted, a window needs": f"a VAF of {limits['min_vaf']:g}, standard errors below "
-        f"{_percent(limits['max_relative_stderr'])}, columns {limits['min_excitation_ratio']:g} times above position "
-        f"noise, {_percent(limits['min_valid_share'])} of its samples",
+        f"{percent(limits['max_relative_stderr'])}, columns {limits['min_excitation_ratio']:g} times above position "
+        f"noise, {percent(limits['min_valid_share'])} of its samples",
     }
 
 
@@ -388,32 +371,3 @@ def _median(values: NDArray[np.float64]) -> float:
 def _spread(values: NDArray[np.float64]) -> float:
     """Standard deviation; one window has none."""
     return float(values.std(ddof=1)) if len(values) > 1 else math.nan
-
-
-def _without_nan(value: Any) -> Any:
-    """The same with plain numbers, and None where there is no number: JSON knows neither NaN nor infinity."""
-    if isinstance(value, Mapping):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    return value
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{plots.number(100 * share, 3)}\N{NO-BREAK SPACE}%"
-
-
-@cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(
-        number=lambda value, digits=4: plots.number(math.nan if value is None else value, digits),
-        percent=_percent,
-        words=plots.words,
-        unit=plots.pretty_unit,
-    )
-    return environment.from_string(resources.files("jaximp").joinpath("report.jinja").read_text(encoding="utf-8"))

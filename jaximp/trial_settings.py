@@ -9,10 +9,13 @@ time = "time_s"                      # columns as in [recording]; or sample_rate
 position = ["x", "y"]                # m, of the hand
 torque = ["fx", "fy"]                # N, of the handle on the hand
 command = ["px", "py"]               # N, the perturbing force: zero in unperturbed trials
-method = "feedback_jerk"
+method = "feedback_jerk"             # or several: the first makes the report, the others stand beside it
 [trials.handle]
 mass = [5, 5]                        # kg, of the admittance
 damping = [20, 20]                   # N s/m
+[trials.posture]                     # perturbed postures, from which the inertia comes; or model.arm.inertia
+file = "postures.parquet"            # what is not given here is as above
+reference = ["rx", "ry"]             # m, that the handle was asked to follow; or command
 ```
 """
 
@@ -39,6 +42,12 @@ TASKS = ("movement", "posture")
 """What the subject does: move and be perturbed at times, or keep a posture."""
 METHOD_NAMES = ("output_error", "feedback_jerk", "gomi_kawato", "erden_billard")
 """What impedance can be identified by."""
+STATIC_WINDOW = 0.4
+"""After the onset of a perturbed posture, from which the inertia is estimated [s]."""
+_POSTURE = ("files", "file", "trial", "onset", "window")
+"""Keys of `[trials.posture]` beside the columns."""
+_ASKED = ("command", "reference")
+"""Columns of which a table has its own, or another table's."""
 _FIXED = ("joint", "gear_ratio", "name", "force")
 """Keys of `load_recording` that have no meaning for a hand in a plane."""
 
@@ -93,8 +102,8 @@ class TrialsSettings:
 
     task: str = "movement"
     """One of `TASKS`."""
-    method: str = "output_error"
-    """One of `METHOD_NAMES`."""
+    method: str | list[str] = "output_error"
+    """One of `METHOD_NAMES`, or several: the first makes the report, the others stand beside it."""
     window: float = VOLUNTARY_DELAY
     """After the onset, from which impedance is estimated [s]."""
     cutoff: list[float] | None = None
@@ -115,6 +124,13 @@ class TrialsSettings:
     """From `[model.arm]`: positions out of its reach are refused."""
     folder: Path = Path()
     """Where relative names start."""
+    posture: TrialsSettings | None = None
+    """`[trials.posture]`: trials of the static task, for the inertia."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """All of them, the main one first."""
+        return (self.method,) if isinstance(self.method, str) else tuple(self.method)
 
     def paths(self) -> list[Path]:
         """Every file, in order; patterns and folders bring theirs in the order of the numbers in their names.
@@ -161,14 +177,39 @@ def trials_settings(table: Any, folder: Path, geometry: ArmGeometry | None) -> T
     if "force" in table:
         raise ValueError("[trials] calls the force on the hand 'torque', as [recording] does: rename 'force'")
     columns = [key for key in list(inspect.signature(load_recording).parameters)[1:] if key not in _FIXED]
-    own = [setting.name for setting in fields(TrialsSettings) if setting.name not in ("mapping", "geometry", "folder")]
-    check_keys(table, [*own, *columns], "[trials]")
+    made_here = ("mapping", "geometry", "folder", "posture")
+    own = [setting.name for setting in fields(TrialsSettings) if setting.name not in made_here]
+    check_keys(table, [*own, *columns, "posture"], "[trials]")
     mapping = {key: value for key, value in table.items() if key in columns}
     check_mapping(mapping, "[trials]")
     plain = settings(TrialsSettings, {key: value for key, value in table.items() if key in own}, "trials")
     made = replace(plain, mapping=mapping, geometry=geometry, folder=folder)
-    _check_files(made, table)
+    _check_files(made, table, "trials")
     _check_values(made)
+    if "posture" in table:
+        made = replace(made, posture=_posture_settings(table["posture"], made, columns))
+    return made
+
+
+def _posture_settings(table: Any, trials: TrialsSettings, columns: list[str]) -> TrialsSettings:
+    """`[trials.posture]`; columns (and the column of the trial) that it does not name are those of `[trials]`."""
+    where = "[trials.posture]"
+    if not isinstance(table, dict):
+        raise ValueError(f"{where} must be a table")
+    if trials.task == "posture":
+        raise ValueError(f"{where} belongs to movements: leave out trials.task, or {where}")
+    check_keys(table, [*_POSTURE, *columns], where)
+    mapping = {key: value for key, value in table.items() if key in columns}
+    instead = dict.fromkeys(_ASKED, _ASKED) | {"sample_rate": ("time",), "time": ("sample_rate",)}
+    replaced = {other for key in mapping for other in instead.get(key, ())}
+    mapping = {key: value for key, value in trials.mapping.items() if key not in replaced} | mapping
+    check_mapping(mapping, where)
+    given = {key: value for key, value in table.items() if key in _POSTURE}
+    usual = {"window": STATIC_WINDOW} | ({"trial": trials.trial} if "file" in table else {})
+    plain = settings(TrialsSettings, usual | given, "trials.posture")
+    made = replace(plain, task="posture", mapping=mapping, geometry=trials.geometry, folder=trials.folder)
+    _check_files(made, table, "trials.posture")
+    _check_window(made.window, "trials.posture")
     return made
 
 
@@ -188,31 +229,36 @@ def arm_settings(table: Any) -> HandArmSettings:
     return arm
 
 
-def _check_files(trials: TrialsSettings, table: Mapping[str, Any]) -> None:
+def _check_files(trials: TrialsSettings, table: Mapping[str, Any], where: str) -> None:
     if (trials.file is None) == (not trials.files):
-        raise ValueError("[trials] needs either 'files' (one a trial) or 'file' (all in one), one of the two")
+        raise ValueError(f"[{where}] needs either 'files' (one a trial) or 'file' (all in one), one of the two")
     if trials.file is None and "trial" in table:
-        raise ValueError("trials.trial tells the trials of one 'file' apart: leave it out beside 'files'")
+        raise ValueError(f"{where}.trial tells the trials of one 'file' apart: leave it out beside 'files'")
 
 
 def _check_values(trials: TrialsSettings) -> None:
-    for name, choices in (("task", TASKS), ("method", METHOD_NAMES)):
-        if getattr(trials, name) not in choices:
-            raise ValueError(
-                f"trials.{name} is '{getattr(trials, name)}': {nearest(getattr(trials, name), list(choices))}"
-            )
+    given = [("task", trials.task, TASKS), *(("method", method, METHOD_NAMES) for method in trials.methods)]
+    for name, value, choices in given:
+        if value not in choices:
+            raise ValueError(f"trials.{name} is '{value}': {nearest(value, list(choices))}")
+    if not trials.methods or len(set(trials.methods)) < len(trials.methods):
+        raise ValueError(f"trials.method is {list(trials.methods)}: name at least one, and each once")
     pairs = {"cutoff": trials.cutoff, "handle.mass": trials.handle.mass, "handle.damping": trials.handle.damping}
     for name, pair in pairs.items():
         if pair is not None and (len(pair) != 2 or not all(x > 0 and math.isfinite(x) for x in pair)):
             raise ValueError(f"trials.{name} is {pair}: it must be two numbers above zero")
-    if not (trials.window > 0 and math.isfinite(trials.window)):
-        raise ValueError(f"trials.window is {trials.window}: it must be a number above zero, in s")
-    if trials.window > 5:
-        raise ValueError(f"trials.window is {trials.window:g} s: were milliseconds meant?")
+    _check_window(trials.window, "trials")
     if not (trials.handle.own_mass >= 0 and math.isfinite(trials.handle.own_mass)):
         raise ValueError(f"trials.handle.own_mass is {trials.handle.own_mass}: it must be zero or more, in kg")
     if trials.trigger is not None and trials.trigger.axis not in (1, 2):
         raise ValueError(f"trials.trigger.axis is {trials.trigger.axis}: it must be 1 or 2")
+
+
+def _check_window(window: float, where: str) -> None:
+    if not (window > 0 and math.isfinite(window)):
+        raise ValueError(f"{where}.window is {window}: it must be a number above zero, in s")
+    if window > 5:
+        raise ValueError(f"{where}.window is {window:g} s: were milliseconds meant?")
 
 
 def _matching(folder: Path, name: str) -> list[Path]:

@@ -11,7 +11,6 @@ from scipy.io import savemat
 from test_identify import TIME, joint
 
 from jaximp import cli
-from jaximp.job import read_job
 from jaximp.recordings import save_recording
 
 JOB = """
@@ -80,28 +79,6 @@ def test_simulate_writes_what_identify_reads(run, tmp_path: Path) -> None:  # ty
     assert run("simulate", "rig", "--holding", "bands", "--out", tmp_path / "rig")[0] == 0
     names = {path.name for path in (tmp_path / "rig").iterdir()}
     assert {"job.toml", "robot_alone.csv", "robot_with_human.csv"} <= names
-
-
-def test_simulated_arm_is_read_by_its_jobs(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    numbers = ("--perturbed", 4, "--unperturbed", 2, "--duration", 1.4)
-    assert run("simulate", "arm", "--out", tmp_path / "arm", "--format", "csv", *numbers)[0] == 0
-    names = ("job.toml", "posture.toml")
-    movements, postures = (read_job(tmp_path / "arm" / name).trials for name in names)
-    assert movements is not None
-    assert postures is not None
-    perturbed, unperturbed, _ = movements.load()
-    held, none, _ = postures.load()
-    assert [len(group) for group in (perturbed, unperturbed or [], held)] == [4, 2, 20]
-    assert none is None
-    truth = json.loads((tmp_path / "arm" / "truth.json").read_text())
-    assert truth["inertia_kgm2"] == pytest.approx([0.1945, 0.0737, 0.0838])
-    stiffness = np.array(truth["stiffness_Nm_per_rad"])
-    assert (np.linalg.eigvalsh(stiffness) > 5).all()
-    np.testing.assert_allclose(truth["damping_Nms_per_rad"], stiffness / 12)
-    assert len(truth["perturbed_trials"]) == 4
-    status, _, said = run("check", tmp_path / "arm" / "job.toml")
-    assert status == 1
-    assert "this job has [trials]" in said
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from jaximp.plots.estimates import (
     torque,
     window_lengths,
 )
+from jaximp.plots.impedance import deviations, impedance_methods, impedance_windows, jerk_spectra, joint_torques
 from jaximp.plots.style import Panel, curves, main_parameter, number, png, pretty_unit, with_unit, words
 
 __all__ = [
@@ -23,8 +24,13 @@ __all__ = [
     "condition_over_time",
     "curves",
     "design",
+    "deviations",
     "effort",
     "ellipses",
+    "impedance_methods",
+    "impedance_windows",
+    "jerk_spectra",
+    "joint_torques",
     "main_parameter",
     "methods",
     "number",

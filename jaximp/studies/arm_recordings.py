@@ -41,8 +41,8 @@ SETTLE = 1.0
 STATIC = (0.5, 1.1)
 """Onset in a recording of the static task, and its duration [s]."""
 
-MOVEMENT = """\
-# Simulated reaching movements, some of them perturbed: Börner et al. 2020, dynamic task.
+JOB = """\
+# Simulated reaching movements, some of them perturbed, and perturbed postures: Börner et al. 2020.
 
 [trials]
 file = "movements.{format}"
@@ -51,7 +51,6 @@ time = "time_s"
 position = ["position1_m", "position2_m"]   # of the hand, from the shoulder
 torque = ["torque1_N", "torque2_N"]         # the force of the handle on the hand
 command = ["command1_N", "command2_N"]      # the perturbing force: zero in unperturbed trials
-task = "movement"
 method = "feedback_jerk"
 window = {window}                              # s
 
@@ -59,25 +58,12 @@ window = {window}                              # s
 mass = {mass}                           # kg
 damping = {damping}                      # N s/m
 
+[trials.posture]                              # for the inertia: the arm keeps a posture, the handle moves it by 8 mm
+file = "postures.{format}"
+reference = ["reference1_m", "reference2_m"]  # what the handle was asked to follow
+
 [model.arm]
 lengths = {lengths}                      # m
-inertia = {inertia}          # kg m^2, eq. (12); the truth, which posture.toml is there to find
-"""
-
-POSTURE = """\
-# The same arm keeps a posture while the handle moves it by 8 mm: the static task, for the inertia.
-
-[trials]
-file = "postures.{format}"
-trial = "trial"
-time = "time_s"
-position = ["position1_m", "position2_m"]
-torque = ["torque1_N", "torque2_N"]
-reference = ["reference1_m", "reference2_m"] # what the handle was asked to follow
-task = "posture"
-
-[model.arm]
-lengths = {lengths}
 """
 
 
@@ -171,8 +157,8 @@ def write_arm_recordings(
     format: str = "parquet",
     progress: Progress = lambda share: None,
 ) -> None:
-    """Write `movements` and `postures` (one file each, with a column `trial`), job.toml and posture.toml that read
-    them, and truth.json with the impedance and the inertia behind them."""
+    """Write `movements` and `postures` (one file each, with a column `trial`), the job.toml that reads them, and
+    truth.json with the impedance and the inertia behind them."""
     arm, sensors = NeuromuscularArm(), sensors or Sensors()
     moved = arm_movements(arm, perturbed, unperturbed, seed, duration)
     progress(0.4)
@@ -183,11 +169,10 @@ def write_arm_recordings(
     static = as_recordings(held, sensors, seed + 1, settled, static=True)
     save_trial_table(static, folder / f"postures.{format}")
     progress(0.9)
-    numbers = {"lengths": arm.lengths, "inertia": arm.inertia, "mass": arm.handle.mass, "damping": arm.handle.damping}
+    numbers = {"lengths": arm.lengths, "mass": arm.handle.mass, "damping": arm.handle.damping}
     lists = {name: np.asarray(x).tolist() for name, x in numbers.items()}
-    values: dict[str, object] = {"format": format, "window": WINDOW, **lists}
-    for name, text in (("job.toml", MOVEMENT), ("posture.toml", POSTURE)):
-        (folder / name).write_text(text.format(**values), encoding="utf-8")
+    text = JOB.format(format=format, window=WINDOW, **lists)
+    (folder / "job.toml").write_text(text, encoding="utf-8")
     truth = json.dumps(true_values(arm, moved, seed), indent=1) + "\n"
     (folder / "truth.json").write_text(truth, encoding="utf-8")
 

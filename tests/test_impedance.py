@@ -1,0 +1,376 @@
+"""Impedance from perturbation trials: through the command line, and every verdict with its reason."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from jaximp import cli, impedance
+from jaximp.impedance import ArmImpedance, at_other_windows, identify_impedance, identify_trials
+from jaximp.isolation import METHODS, Deviations, Impedance, Isolated, JointDeviations, KnownArm, Method
+from jaximp.job import parse_job, read_job
+from jaximp.models import ArmGeometry
+from jaximp.movements import Movements
+from jaximp.trust import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
+
+NASTY = "<script>alert(1).csv"
+FIGURES = {"deviations", "spectra", "torques", "windows", "methods"}
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small simulated recordings with their job."""
+    folder = tmp_path_factory.mktemp("simulated") / "arm"
+    numbers = ("--perturbed", 10, "--unperturbed", 6, "--duration", 1.4)
+    assert jaximp("simulate", "arm", "--out", folder, "--format", "csv", *numbers) == 0
+    return folder
+
+
+def jaximp(*arguments: object) -> int:
+    """Run the command line in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        patch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+    return int(stopped.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def results(arm: Path) -> Path:
+    """Of two methods, from a file with a nasty name."""
+    text = (arm / "job.toml").read_text()
+    text = text.replace('"feedback_jerk"', '["feedback_jerk", "gomi_kawato"]').replace("movements.csv", NASTY)
+    (arm / "two.toml").write_text(text + "# <b>bold</b>\n")
+    (arm / NASTY).write_bytes((arm / "movements.csv").read_bytes())
+    assert jaximp("identify", arm / "two.toml", "--out", arm / "out") == 0
+    return arm / "out"
+
+
+def test_simulated_arm_is_read_by_its_job(arm: Path) -> None:
+    job = read_job(arm / "job.toml")
+    assert job.trials is not None
+    assert job.trials.posture is not None
+    perturbed, unperturbed, _ = job.trials.load()
+    held, none, _ = job.trials.posture.load()
+    assert [len(group) for group in (perturbed, unperturbed or [], held)] == [10, 6, 20]
+    assert none is None
+    assert job.trials.methods == ("feedback_jerk",)
+    assert {path.name for path in job.files()} == {"movements.csv", "postures.csv"}
+    truth = json.loads((arm / "truth.json").read_text())
+    assert truth["inertia_kgm2"] == pytest.approx([0.1945, 0.0737, 0.0838])
+    stiffness = np.array(truth["stiffness_Nm_per_rad"])
+    assert (np.linalg.eigvalsh(stiffness) > 5).all()
+    np.testing.assert_allclose(truth["damping_Nms_per_rad"], stiffness / 12)
+    assert len(truth["perturbed_trials"]) == 10
+
+
+def test_simulated_trials_are_identified(results: Path, arm: Path) -> None:
+    truth, found = (json.loads(path.read_text()) for path in (arm / "truth.json", results / "summary.json"))
+    for method, error in ((found, 0.1), (found["further_methods"][0], 0.1)):
+        np.testing.assert_allclose(method["damping_Nms_per_rad"], truth["damping_Nms_per_rad"], atol=2.4 * error)
+        assert method["explained_share"] > 0.8
+        assert method["held_out_share"] > 0.7
+    np.testing.assert_allclose(found["inertia_kgm2"], truth["inertia_kgm2"], rtol=0.1)
+    for name, value in found["parameters"].items():
+        true = np.array(truth["damping_Nms_per_rad" if name[0] == "D" else "stiffness_Nm_per_rad"])
+        error = value["value"] - true[int(name[1]) - 1, int(name[2]) - 1]
+        assert abs(error) < 4 * value["stderr"], name
+    assert found["recording"] | {"sample_rate_hz": 0} == {
+        "name": NASTY, "sample_rate_hz": 0, "perturbed": 10, "unperturbed": 6, "postures": 20,
+    }  # fmt: skip
+    np.testing.assert_allclose(found["hand_at_onset_m"], truth["hand_at_onset_m"], atol=1e-3)
+    np.testing.assert_allclose(found["cutoff_hz"], [1.9, 2.2], atol=0.8)
+
+
+def test_all_files_are_there(results: Path) -> None:
+    names = {f"{name}.png" for name in FIGURES} | {"estimates.parquet", "summary.json", "report.html", ".jaximp"}
+    assert {path.name for path in results.iterdir()} == names
+
+
+def test_table_has_a_row_for_each_method(results: Path) -> None:
+    table = pq.read_table(results / "estimates.parquet")
+    rows = table.to_pylist()
+    assert [row["method"] for row in rows] == ["feedback_jerk", "gomi_kawato"]
+    assert rows[0]["K21"] == rows[0]["K12"]
+    assert rows[1]["K21"] != rows[1]["K12"]
+    assert {"D11_stderr", "inertia_1", "inertia_1_stderr", "explained", "verdict", "reason"} <= set(rows[0])
+    assert table.schema.field("K11").metadata[b"unit"] == b"N m/rad"
+
+
+def test_summary_is_json(results: Path) -> None:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    found = json.loads((results / "summary.json").read_text(), parse_constant=refuse)
+    assert [one["method"] for one in found["further_methods"]] == ["gomi_kawato"]
+    lengths = [one["window_s"] for one in found["window_lengths"]]
+    assert lengths == sorted(lengths)
+    assert lengths[0] == pytest.approx(0.04)
+    at = lengths.index(0.115)
+    for name, value in found["parameters"].items():
+        again = found["window_lengths"][at]["parameters"][name]
+        assert again["value"] == pytest.approx(value["value"], rel=1e-6)
+        assert again["stderr"] == pytest.approx(value["stderr"], rel=1e-6)
+
+
+def test_report_is_self_contained_and_escaped(results: Path) -> None:
+    page = (results / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|<link|<script|@import|url\(", page)
+    assert page.count('src="data:image/png;base64,') == len(FIGURES)
+    assert "&lt;script&gt;alert(1)" in page
+    assert "&lt;b&gt;bold" in page
+    assert "16 % too large" in page
+
+
+def test_check_says_what_the_sensors_allow(arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert jaximp("check", arm / "job.toml") == 0
+    said = capsys.readouterr().out
+    assert "10 perturbed movements, 6 unperturbed ones" in said
+    assert "20 perturbed postures" in said
+
+
+# --- jobs that cannot be identified -----------------------------------------------------------------------------------
+
+POSTURE = "[trials.posture]                              # for the inertia: the arm keeps a posture"
+BAD_JOBS = {
+    "no such method": ('"feedback_jerk"', '"feedback"', "did you mean 'feedback_jerk'"),
+    "no method": ('"feedback_jerk"', "[]", "name at least one"),
+    "one twice": ('"feedback_jerk"', '["gomi_kawato", "gomi_kawato"]', "each once"),
+    "two inertias": ("[model.arm]", "[model.arm]\ninertia = [0.2, 0.07, 0.08]", "keep one of them"),
+    "unknown key": ("[trials.posture]", "[trials.posture]\nmethod = 'x'", "[trials.posture] has an unknown key 'met"),
+    "long posture": ("[trials.posture]", "[trials.posture]\nwindow = 2", "[trials.posture]: a window of 2 s"),
+    "ms": ("[trials.posture]", "[trials.posture]\nwindow = 400", "trials.posture.window is 400 s: were millise"),
+    "no file": ('file = "postures.csv"', "", "[trials.posture] needs either"),
+    "file is gone": ("postures.csv", "none.csv", "none.csv"),
+    "the movements' command": ("reference = ", "# reference = ", "command1_N"),
+    "postures of postures": ("[trials.handle]", "task = 'posture'\n[trials.handle]", "belongs to movements"),
+    "long window": ("window = 0.115", "window = 1.5", "1.5"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_JOBS)
+def test_bad_jobs_end_in_one_line(arm: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    old, new, message = BAD_JOBS[case]
+    text = (arm / "job.toml").read_text()
+    assert old in text
+    refused(arm, text.replace(old, new, 1), message, capsys)
+
+
+def refused(arm: Path, text: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (arm / "bad.toml").write_text(text)
+    assert jaximp("identify", arm / "bad.toml", "--out", arm / "bad") == 1
+    complained = capsys.readouterr().err
+    assert complained.startswith("error: ")
+    assert complained.strip().count("\n") == 0
+    assert message in complained
+    assert not (arm / "bad").exists()
+
+
+def test_inertia_must_be_known(arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (arm / "job.toml").read_text()
+    start, end = text.index("[trials.posture]"), text.index("[model.arm]")
+    refused(arm, text[:start] + text[end:], "the arm's inertia is not known: add [trials.posture]", capsys)
+    alone = text[:start].replace("movements.csv", "postures.csv").replace("command", "reference")
+    alone = alone.replace("method =", 'task = "posture"\nmethod =')
+    refused(arm, alone + text[end:], "a job of postures alone", capsys)
+
+
+def test_given_inertia_without_errors_is_a_warning(arm: Path) -> None:
+    text = (arm / "job.toml").read_text()
+    start, end = text.index("[trials.posture]"), text.index("[model.arm]")
+    job = parse_job(text[:start] + text[end:] + "inertia = [0.1945, 0.0737, 0.0838]\n", arm)
+    found = identify_trials(job)
+    assert found.static is None
+    assert any("given without standard errors" in warning for warning in found.main.warnings)
+    assert found.main.inertia_stderr is None
+
+
+def test_postures_inherit_columns() -> None:
+    trials = read_trials("time = 't'\nreference = ['rx', 'ry']\ncommand = ['cx', 'cy']\n", "file = 'p.csv'\n")
+    assert trials.mapping == {
+        "time": "t", "position": ["x", "y"], "torque": ["fx", "fy"], "reference": ["rx", "ry"], "command": ["cx", "cy"],
+    }  # fmt: skip
+    assert (trials.task, trials.trial, trials.window) == ("posture", "which", 0.4)
+    other = read_trials(
+        "time = 't'\ncommand = ['cx', 'cy']\n", "files = ['p.csv']\nsample_rate = 500\nreference = ['rx', 'ry']\n"
+    )
+    assert other.mapping == {
+        "position": ["x", "y"], "torque": ["fx", "fy"], "sample_rate": 500.0, "reference": ["rx", "ry"],
+    }  # fmt: skip
+
+
+def read_trials(movements: str, posture: str) -> Any:
+    text = "[trials]\nfile = 'm.csv'\ntrial = 'which'\nposition = ['x', 'y']\ntorque = ['fx', 'fy']\n" + movements
+    job = parse_job(f"{text}[trials.posture]\n{posture}[model.arm]\nlengths = [0.3, 0.3]\n")
+    assert job.trials is not None
+    assert [path.name for path in job.files()] == ["m.csv", "p.csv"]
+    return job.trials.posture
+
+
+# --- verdicts, each on joint deviations that are made for it ----------------------------------------------------------
+
+D = np.array([[2.4, 1.2], [1.2, 1.4]])
+K = np.array([[29.0, 14.0], [14.0, 17.0]])
+GEOMETRY = ArmGeometry((0.29, 0.34))
+ARM = KnownArm(GEOMETRY, np.array([0.1945, 0.0737, 0.0838]), inertia_stderr=np.array([1e-4, 1e-4, 1e-4]))
+SAMPLES = 60
+Identify = Callable[..., ArmImpedance]
+
+
+def movements(trials: int) -> Movements:
+    """A hand that rests."""
+    zero = jnp.zeros((trials, SAMPLES, 2))
+    return Movements(
+        zero + jnp.array([0.0, 0.4]), zero, zero, zero, zero, jnp.zeros(trials, int), SAMPLES / 0.115
+    )  # fmt: skip
+
+
+@pytest.fixture
+def identified(monkeypatch: pytest.MonkeyPatch) -> Identify:
+    """Identify made-up joint deviations: D and K of each trial, with noise of a share of the torque."""
+
+    def identify(
+        trials: int = 10,
+        D: np.ndarray = D,
+        K: np.ndarray = K,
+        noise: float = 0.02,
+        pitch: float = 3.0,
+        arm: KnownArm = ARM,
+        own: Impedance | None = None,
+        linearised: bool = False,
+        window: float = 0.115 - 0.115 / SAMPLES,
+        limits: TrustLimits | None = None,
+        flat: bool = False,
+        notes: tuple[str, ...] = (),
+    ) -> ArmImpedance:
+        rng = np.random.default_rng(3)
+        t = np.linspace(0, 1, SAMPLES)[:, None]
+        ways = rng.normal(size=(trials, 1, 2))
+        ways = np.broadcast_to(ways[:1], ways.shape) if flat else ways
+        displacement = 0.01 * ways * t**2 * (1 - t / 2)
+        velocity = 0.01 * ways * (2 * t - 1.5 * t**2) / 0.115
+        torque = np.einsum("tij,tsj->tsi", np.broadcast_to(D, (trials, 2, 2)), velocity)
+        torque += np.einsum("tij,tsj->tsi", np.broadcast_to(K, (trials, 2, 2)), displacement)
+        torque += noise * torque.std() * rng.normal(size=(trials, 1, 2)) * np.sin(pitch * t)
+        joint = JointDeviations(*map(jnp.asarray, (displacement, velocity, torque)))
+        zero = jnp.zeros((trials, SAMPLES, 2))
+        isolated = Isolated(Deviations(zero, zero, zero, zero), impedance=own)
+        monkeypatch.setattr(impedance, "joint_deviations", lambda *_: joint)
+        monkeypatch.setitem(METHODS, "made_up", Method("MAD", "made up", lambda *_: isolated, linearised))
+        return identify_impedance(
+            movements(trials), None, arm, "made_up", window, limits=limits or TrustLimits(), notes=notes
+        )
+
+    return identify
+
+
+def test_good_trials_are_trusted(identified: Identify) -> None:
+    found = identified(notes=("a note", "a note"))
+    assert (found.verdict, found.reason, found.warnings, found.notes) == (TRUSTED, "", (), ("a note",))
+    np.testing.assert_allclose(found.D, D, atol=0.1)
+    np.testing.assert_allclose(found.K, K, atol=2)
+    assert found.names == ("D11", "D12", "D21", "D22", "K11", "K12", "K22")
+    assert identified(linearised=True).names == ("D11", "D12", "D21", "D22", "K11", "K12", "K21", "K22")
+    assert found.held_out < found.explained <= 1
+    low, high = found.interval()
+    assert ((low < found.theta) & (found.theta < high)).all()
+
+
+def test_errors_of_the_inertia_widen_the_interval(arm: Path) -> None:
+    job = read_job(arm / "job.toml")
+    assert job.trials is not None
+    perturbed, unperturbed, _ = job.trials.load()
+    several = []
+    for share in (1e-9, 0.03, 0.06):
+        known = KnownArm(GEOMETRY, ARM.inertia, inertia_stderr=share * np.asarray(ARM.inertia))
+        several.append(identify_impedance(perturbed, unperturbed, known, "gomi_kawato").covariance)
+    np.testing.assert_allclose(several[2] - several[0], 4 * (several[1] - several[0]), rtol=1e-4, atol=1e-6)
+    assert several[1][4, 4] > 1.05 * several[0][4, 4]
+
+
+def of_trials(matrix: np.ndarray, spread: float, trials: int = 10) -> np.ndarray:
+    """A matrix for each trial, alternately larger and smaller."""
+    return matrix * (1 + spread * np.where(np.arange(trials) % 2, 1, -1))[:, None, None]
+
+
+def own(D: np.ndarray = D, K: np.ndarray = K, error: float = 0.02, dof: float = 30.0, misfit: float = 1.0) -> Impedance:
+    """What a method of its own says."""
+    sizes = np.array([2.4] * 4 + [29.0] * 3)
+    return Impedance(*map(jnp.asarray, (D, K, np.diag((error * sizes) ** 2), ARM.inertia, dof, misfit)))
+
+
+LOOSE = TrustLimits(max_relative_stderr=100.0)
+INDEFINITE = np.array([[29.0, 25.0], [25.0, 17.0]])
+CASES: dict[str, tuple[dict[str, Any], str, str]] = {
+    "co-linear": ({"flat": True}, WEAK, "there is no estimate: velocities and displacements are co-linear"),
+    "not finite": ({"K": K * np.nan}, NO_DATA, "a number is not finite: look for gaps"),
+    "few trials": ({"trials": 4}, WEAK, "cannot be judged: 4 perturbed trials are too few"),
+    "loud": ({"noise": 3.0}, WEAK, "is [0-9.]+ % of the size of the (stiffness|damping), above 20 %: perturb more"),
+    "indefinite": ({"K": INDEFINITE}, POOR, r"indefinite stiffness \(an eigenvalue of -[0-9.]+ N m/rad\)"),
+    "indefinite, free": ({"K": INDEFINITE, "linearised": True}, POOR, "indefinite stiffness"),
+    "driving": ({"D": D - 2.0 * np.eye(2)}, POOR, "damping is not positive definite: an eigenvalue of -"),
+    "unexplained": (
+        {"noise": 1.0, "pitch": 60.0, "limits": LOOSE},
+        POOR,
+        "explain [0-9.]+ % of the isolated torque, less than 75 %",
+    ),
+    "no body": (
+        {"arm": KnownArm(GEOMETRY, np.array([0.01, 0.0737, 0.0838]), inertia_stderr=np.full(3, 1e-4))},
+        POOR,
+        "no rigid body has the inertia 0.01, 0.0737, 0.0838",
+    ),
+    "own": ({"own": own()}, TRUSTED, ""),
+    "own, misfit": ({"own": own(misfit=1.7)}, POOR, "1.7 times what the unperturbed movements let expect.*timing"),
+    "own, loud": ({"own": own(error=0.4)}, WEAK, "perturb more"),
+    "own, few": ({"own": own(dof=2.0)}, WEAK, "2 degrees of freedom are too few"),
+    "own, indefinite": ({"own": own(K=INDEFINITE)}, POOR, "indefinite stiffness"),
+    "own, failed": ({"own": own(K=K * np.nan)}, NO_DATA, "a number is not finite"),
+    "own, without errors": ({"own": own(error=np.nan)}, WEAK, "cannot be judged"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_verdicts_name_cause_and_remedy(identified: Identify, case: str) -> None:
+    options, verdict, reason = CASES[case]
+    found = identified(**options)
+    assert found.verdict == verdict, found.reason
+    assert re.search(reason, found.reason)
+    assert "\n" not in found.reason
+
+
+def test_half_of_the_trials_must_predict_the_others(identified: Identify) -> None:
+    options: dict[str, Any] = {"D": of_trials(D, 0.3), "K": of_trials(K, 0.3), "noise": 0.0}
+    found = identified(**options)
+    assert found.held_out < found.explained - 0.02
+    between = TrustLimits(min_vaf=(found.held_out + found.explained) / 2, max_relative_stderr=100.0)
+    judged = identified(**options, limits=between)
+    assert judged.verdict == POOR
+    assert "half of the trials predicts" in judged.reason
+
+
+def test_warnings_leave_the_verdict(identified: Identify) -> None:
+    lopsided = K + np.array([[0, 8.0], [-8.0, 0]])
+    found = identified(K=lopsided, linearised=True, arm=KnownArm(GEOMETRY, ARM.inertia), window=0.2)
+    assert found.verdict == TRUSTED
+    for words in ("the window of 200 ms is longer", "without standard errors", "stiffness is not symmetric"):
+        assert any(words in warning for warning in found.warnings)
+
+
+def test_a_method_of_its_own_has_no_other_windows(identified: Identify) -> None:
+    identified(own=own())
+    assert at_other_windows(movements(10), None, ARM, "made_up", 0.05) is None
+
+
+def test_unknown_methods_are_named() -> None:
+    with pytest.raises(ValueError, match=r"there is no method 'gomi_kavato': did you mean 'gomi_kawato'"):
+        identify_impedance(movements(5), None, ARM, "gomi_kavato")
