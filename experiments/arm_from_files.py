@@ -50,7 +50,7 @@ def main() -> None:
             folder = Path(name)
             write_arm_recordings(folder, seed=seed)
             truth = json.loads((folder / "truth.json").read_text())
-            text = (folder / "job.toml").read_text().replace('"feedback_jerk"', json.dumps(list(METHODS)))
+            text = (folder / "job.toml").read_text().replace('"output_error"', json.dumps(list(METHODS)))
             result = identify_trials(parse_job(text, folder))
             for found in result.estimates:
                 rows.setdefault(found.method, []).append(compared(found, truth))

@@ -113,8 +113,8 @@ class ArmImpedance:
     on_boundary: bool
     """The stiffness is singular, since the data ask for an indefinite one."""
     explained: float
-    """Share of the isolated joint torques that damping and stiffness explain. (Of a method that estimates the impedance
-    itself it is no measure: it need not know the acceleration well, and the `misfit` tells.)"""
+    """Share of the isolated joint torques that damping and stiffness explain; NaN of a method that estimates the
+    impedance itself, which need not know the acceleration well: there the `misfit` tells."""
     held_out: float
     """Share of the torques that is predicted from the other half of the trials; NaN where it was not tried."""
     misfit: float | None
@@ -231,7 +231,7 @@ def identify_impedance(
         K=K,
         arm=arm,
         on_boundary=on_boundary,
-        explained=1 - left / torque if torque > 0 else np.nan,
+        explained=1 - left / torque if torque > 0 and misfit is None else np.nan,
         held_out=held_out,
         misfit=misfit,
         position=position,

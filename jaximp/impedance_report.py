@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import Array
 
 from jaximp import plots
 from jaximp.impedance import MISFIT, ArmImpedance, TrialsResult
 from jaximp.isolation import METHODS
 from jaximp.job import Job
+from jaximp.models import (
+    Ellipse,
+    EndpointImpedance,
+    ellipse,
+    endpoint_damping,
+    endpoint_impedance,
+    endpoint_stiffness,
+    propagated_stderr,
+)
 from jaximp.pages import inline, percent, table_of, template, versions, without_nan, write_figures, write_summary
 from jaximp.types import Numbers
 
@@ -55,7 +67,12 @@ def write_trials_results(folder: str | Path, result: TrialsResult, job: Job) -> 
 def draw_figures(result: TrialsResult) -> dict[str, bytes]:
     """All figures of a report as PNG files."""
     main = result.main
-    figures = {"deviations": plots.deviations(main), "torques": plots.joint_torques(main)}
+    figures = {"deviations": plots.deviations(main)}
+    if main.misfit is None:  # a method that need not know the acceleration well has no torques to show
+        figures["torques"] = plots.joint_torques(main)
+    figures["ellipses"] = plots.ellipses(
+        main.arm.geometry, main.angles, {METHODS[one.method].short: _at_hand(one) for one in result.estimates}
+    )
     if result.spectra is not None:
         cutoff = next((one.cutoff for one in result.estimates if one.cutoff is not None), None)
         figures["spectra"] = plots.jerk_spectra(result.spectra, cutoff)
@@ -110,9 +127,36 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
     return without_nan(content)
 
 
-def endpoint(found: ArmImpedance) -> dict[str, Any] | None:
-    """Impedance at the hand: `models.endpoint_impedance` and `models.ellipse` belong here, with a figure `ellipses`."""
-    return None
+def endpoint(found: ArmImpedance) -> dict[str, Any]:
+    """Impedance at the hand where it was at the onset, and its ellipses, with the standard errors of D and K."""
+    at_hand = _at_hand(found)
+    content: dict[str, Any] = {"position_m": found.position.tolist(), "angles_rad": found.angles.tolist()}
+    for name, unit, letter in (("inertia", "kg", ""), ("damping", "Ns_per_m", "D"), ("stiffness", "N_per_m", "K")):
+        matrix = getattr(at_hand, name)
+        content[f"{name}_{unit}"] = np.asarray(matrix).tolist()
+        content[f"{name}_ellipse"] = _in_plain_numbers(ellipse(matrix))
+        if letter:
+            spread = propagated_stderr(
+                partial(_ellipse_of, found, letter), jnp.asarray(found.theta), jnp.asarray(found.covariance)
+            )
+            content[f"{name}_ellipse_stderr"] = _in_plain_numbers(spread)
+    return content
+
+
+def _at_hand(found: ArmImpedance) -> EndpointImpedance:
+    return endpoint_impedance(found.arm.geometry, found.angles, found.arm.xi, found.D, found.K)
+
+
+def _ellipse_of(found: ArmImpedance, letter: str, theta: Array) -> Ellipse:
+    """At the hand, of the damping or stiffness among estimates."""
+    at = {name: theta[k] for k, name in enumerate(found.names)}
+    rows = [[at.get(f"{letter}{i}{j}", at[f"{letter}12"]) for j in (1, 2)] for i in (1, 2)]
+    of_hand = endpoint_damping if letter == "D" else endpoint_stiffness
+    return ellipse(of_hand(found.arm.geometry, jnp.asarray(found.angles), jnp.array(rows)))
+
+
+def _in_plain_numbers(one: Ellipse) -> dict[str, float]:
+    return {name: float(value) for name, value in vars(one).items()}
 
 
 def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:

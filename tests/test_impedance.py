@@ -23,7 +23,7 @@ from jaximp.movements import Movements
 from jaximp.trust import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
 
 NASTY = "<script>alert(1).csv"
-FIGURES = {"deviations", "spectra", "torques", "windows", "methods"}
+FIGURES = {"deviations", "spectra", "torques", "ellipses", "windows", "methods"}
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def jaximp(*arguments: object) -> int:
 def results(arm: Path) -> Path:
     """Of two methods, from a file with a nasty name."""
     text = (arm / "job.toml").read_text()
-    text = text.replace('"feedback_jerk"', '["feedback_jerk", "gomi_kawato"]').replace("movements.csv", NASTY)
+    text = text.replace('"output_error"', '["feedback_jerk", "gomi_kawato"]').replace("movements.csv", NASTY)
     (arm / "two.toml").write_text(text + "# <b>bold</b>\n")
     (arm / NASTY).write_bytes((arm / "movements.csv").read_bytes())
     assert jaximp("identify", arm / "two.toml", "--out", arm / "out") == 0
@@ -64,7 +64,7 @@ def test_simulated_arm_is_read_by_its_job(arm: Path) -> None:
     held, none, _ = job.trials.posture.load()
     assert [len(group) for group in (perturbed, unperturbed or [], held)] == [10, 6, 20]
     assert none is None
-    assert job.trials.methods == ("feedback_jerk",)
+    assert job.trials.methods == ("output_error",)
     assert {path.name for path in job.files()} == {"movements.csv", "postures.csv"}
     truth = json.loads((arm / "truth.json").read_text())
     assert truth["inertia_kgm2"] == pytest.approx([0.1945, 0.0737, 0.0838])
@@ -143,9 +143,9 @@ def test_check_says_what_the_sensors_allow(arm: Path, capsys: pytest.CaptureFixt
 
 POSTURE = "[trials.posture]                              # for the inertia: the arm keeps a posture"
 BAD_JOBS = {
-    "no such method": ('"feedback_jerk"', '"feedback"', "did you mean 'feedback_jerk'"),
-    "no method": ('"feedback_jerk"', "[]", "name at least one"),
-    "one twice": ('"feedback_jerk"', '["gomi_kawato", "gomi_kawato"]', "each once"),
+    "no such method": ('"output_error"', '"feedback"', "did you mean 'feedback_jerk'"),
+    "no method": ('"output_error"', "[]", "name at least one"),
+    "one twice": ('"output_error"', '["gomi_kawato", "gomi_kawato"]', "each once"),
     "two inertias": ("[model.arm]", "[model.arm]\ninertia = [0.2, 0.07, 0.08]", "keep one of them"),
     "unknown key": ("[trials.posture]", "[trials.posture]\nmethod = 'x'", "[trials.posture] has an unknown key 'met"),
     "long posture": ("[trials.posture]", "[trials.posture]\nwindow = 2", "[trials.posture]: a window of 2 s"),

@@ -51,7 +51,7 @@ time = "time_s"
 position = ["position1_m", "position2_m"]   # of the hand, from the shoulder
 torque = ["torque1_N", "torque2_N"]         # the force of the handle on the hand
 command = ["command1_N", "command2_N"]      # the perturbing force: zero in unperturbed trials
-method = "feedback_jerk"
+method = "output_error"                       # or a list: the first makes the report
 window = {window}                              # s
 
 [trials.handle]
