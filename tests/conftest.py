@@ -13,6 +13,19 @@ jax.config.update("jax_enable_x64", True)
 install_import_hook("jaximp", "shapes.checked")
 
 
+MANY_MAPS = 20_000
+"""Pieces of memory of one process. Every compiled program takes some, and at 65 530 Linux gives no more: XLA aborts."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_compiled_programs() -> Iterator[None]:
+    """A worker compiles for hundreds of tests: what it has compiled is dropped before there is too much of it."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """Real recordings, which are not part of this project."""
