@@ -35,6 +35,7 @@ from jaximp.job import Job
 from jaximp.least_squares import confidence_interval
 from jaximp.movement_trials import VOLUNTARY_DELAY, window_warning
 from jaximp.movements import Movements
+from jaximp.signals import require_float64
 from jaximp.stiffness import (
     ELEMENTS,
     FEWEST_TRIALS,
@@ -635,6 +636,7 @@ def identify_trials(job: Job, progress: Progress = lambda share: None) -> Trials
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
+    require_float64()
     trials = job.trials
     if trials is None:
         raise ValueError("this job has no [trials]: identify() is for recordings with windows")

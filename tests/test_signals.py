@@ -192,6 +192,8 @@ def _scipy_filters(sos: NDArray[np.float64], n: int) -> bool:
 
 def test_float64_off_is_one_clear_error() -> None:
     sos = butterworth(2, 20, RATE)
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        require_float64()
     with jax.enable_x64(False):
         with pytest.raises(ValueError, match="jax_enable_x64"):
             filter_zero_phase(sos, noise(100))
