@@ -63,7 +63,7 @@ USUAL = TrustLimits()
 UNITS = {"D": "N m s/rad", "K": "N m/rad"}
 MATRICES = {"D": "damping", "K": "stiffness"}
 BIASES = {
-    "feedback_jerk": "feedback jerk isolation: its stiffness came out 16 % too large on simulated recordings (the "
+    "feedback_jerk": "feedback jerk isolation: its stiffness came out 8 to 23 % too large on simulated recordings (the "
     "filter of the derivatives blurs the onset, from which the jerk is integrated), and 5 to 10 % too small on "
     "simulated motion that is known exactly; the standard errors know of neither (README)",
     "erden_billard": "the state at the onset passes for the unperturbed movement, which suits postures: on simulated "

@@ -283,7 +283,10 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "mass and damping of the handle": f"{numbers(arm['handle_mass_kg'], 'kg')}; "
         f"{numbers(arm['handle_damping_Ns_per_m'], 'N s/m')}",
         "to be trusted, an estimate needs": f"standard errors below {percent(limits['max_relative_stderr'])} of its "
-        f"matrix, a stiffness and a damping that are not indefinite, {percent(limits['min_vaf'])} of the torque "
-        "explained and predicted"
-        + ("" if content["misfit"] is None else f", residuals at most {MISFIT:g} times as large as expected"),
+        "matrix, a stiffness and a damping that are not indefinite, "
+        + (
+            f"{percent(limits['min_vaf'])} of the torque explained and predicted"
+            if content["misfit"] is None
+            else f"residuals at most {MISFIT:g} times as large as expected"
+        ),
     }

@@ -129,7 +129,7 @@ def test_report_is_self_contained_and_escaped(results: Path) -> None:
     assert page.count('src="data:image/png;base64,') == len(FIGURES)
     assert "&lt;script&gt;alert(1)" in page
     assert "&lt;b&gt;bold" in page
-    assert "16 % too large" in page
+    assert "8 to 23 % too large" in page
 
 
 def test_check_says_what_the_sensors_allow(arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
