@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, savgol_filter, sosfilt
 
-from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos
+from jaximp.isolation import static_inertia
+from jaximp.models import ArmGeometry
 from jaximp.movements import Movements
-from jaximp.objectives import solve_gram
 from jaximp.output_error import OutputErrorFit, output_error
 from jaximp.simulation.neuromuscular import (
     ANGLES,
@@ -71,23 +71,10 @@ def simulate(key: jax.Array, duration: float, extra: jax.Array | None = None) ->
 
 
 @eqx.filter_jit
-def static_inertia(key: jax.Array) -> jax.Array:
-    """Base inertial parameters (3,) from 100 perturbed postures: all 11 parameters at once, eq. (35)."""
+def postures(key: jax.Array) -> Movements:
+    """100 trials of the static task."""
     noise = neural_noise(jax.random.split(key, 4)[3], 100, round(1.5 * RATE))
-    movements = hold_posture(ARM, np.repeat(POSTURES, 20, axis=0), np.tile(ANGLES, 5), noise)
-    first, samples, model = round(RATE), round(0.4 * RATE) + 1, PlanarArm((0.0, 0.0))
-
-    def normal_equations(x: jax.Array, v: jax.Array, a: jax.Array, force: jax.Array) -> tuple[jax.Array, jax.Array]:
-        q, dq, ddq = GEOMETRY.joint_motion(x, v, a)
-        W, torque = model.at(q[0]).regressor(q, dq, ddq), GEOMETRY.joint_torque(q, force)
-        return jnp.einsum("snp,snq->pq", W, W), jnp.einsum("snp,sn->p", W, torque - torque[:1])
-
-    cut = (x[:, first : first + samples] for x in (movements.position, movements.velocity, movements.acceleration))
-    gram, moment = jax.vmap(normal_equations)(*cut, movements.force[:, first : first + samples])
-    gram, moment = gram.sum(axis=0), moment.sum(axis=0)
-    size = jnp.sqrt(jnp.diagonal(gram))
-    theta = solve_gram(gram / jnp.outer(size, size), (moment / size)[:, None])[:, 0] / size
-    return borner_from_lakatos(theta[:3])
+    return hold_posture(ARM, np.repeat(POSTURES, 20, axis=0), np.tile(ANGLES, 5), noise)
 
 
 class Trials(NamedTuple):
@@ -225,7 +212,7 @@ def run(cases: tuple[Case, ...]) -> dict[str, Any]:
     inertia: dict[int, Numbers] = {}
     for k in range(max(case.simulations for case in cases)):
         seed = FIRST_SEED + k
-        inertia[k] = np.asarray(static_inertia(jax.random.key(seed)))
+        inertia[k] = np.asarray(static_inertia(postures(jax.random.key(seed)), GEOMETRY).inertia)
         trials: dict[tuple[float, float], Trials] = {}
         for case in (case for case in cases if k < case.simulations):
             kind = case.duration, case.tremor

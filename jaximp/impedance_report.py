@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Array
 
 from jaximp import plots
-from jaximp.impedance import MISFIT, ArmImpedance, TrialsResult
+from jaximp.impedance import ArmImpedance, TrialsResult
 from jaximp.isolation import METHODS
 from jaximp.job import Job
 from jaximp.models import (
@@ -27,6 +27,7 @@ from jaximp.models import (
     endpoint_stiffness,
     propagated_stderr,
 )
+from jaximp.output_error import MISFIT
 from jaximp.pages import inline, percent, table_of, template, versions, without_nan, write_figures, write_summary
 from jaximp.types import Numbers
 
@@ -45,7 +46,8 @@ CAPTIONS = {
     "top than unperturbed ones have at all; what the movement has beyond it passes for an answer to the perturbation.",
     "torques": "Torque of the handle on the joints, less what the inertia takes, against what damping and stiffness "
     "make of the deviations.",
-    "ellipses": "Stiffness, damping and inertia that are felt at the hand, where it was at the onset.",
+    "ellipses": "Stiffness, damping and inertia that are felt at the hand, where it was at the onset. (A force that "
+    "the hand exerts meanwhile adds to its stiffness; that part is left out.)",
     "windows": "The same trials from shorter and longer windows. Where estimates go on changing up to the window that "
     "was chosen, they depend on it; beyond the voluntary delay the arm may answer at will.",
     "methods": "The same trials by other methods; hollow and pale where the estimate is not trusted.",
@@ -102,6 +104,7 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
     The main method's results stand at the top level, those of further methods under `further_methods`.
     """
     assert job.trials is not None
+    handle = result.main.arm.handle
     content = {
         **_result(result.main),
         "further_methods": [_result(one) for one in result.estimates[1:]],
@@ -116,8 +119,8 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
         },
         "arm": {
             "lengths_m": list(result.main.arm.geometry.lengths),
-            "handle_mass_kg": np.asarray(result.main.arm.handle.mass, float).tolist(),
-            "handle_damping_Ns_per_m": np.asarray(result.main.arm.handle.damping, float).tolist(),
+            "handle_mass_kg": None if handle is None else np.asarray(handle.mass, float).tolist(),
+            "handle_damping_Ns_per_m": None if handle is None else np.asarray(handle.damping, float).tolist(),
             "inertia_from": "given" if result.static is None else "the static task",
         },
         "trust_limits": asdict(job.trust),
@@ -144,7 +147,7 @@ def endpoint(found: ArmImpedance) -> dict[str, Any]:
 
 
 def _at_hand(found: ArmImpedance) -> EndpointImpedance:
-    return endpoint_impedance(found.arm.geometry, found.angles, found.arm.xi, found.D, found.K)
+    return endpoint_impedance(found.arm.geometry, found.angles, found.improved.xi, found.D, found.K)
 
 
 def _ellipse_of(found: ArmImpedance, letter: str, theta: Array) -> Ellipse:
@@ -178,6 +181,9 @@ def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
             (f"inertia_{k + 1}_stderr", "kg m^2", stderr),
         ]
     columns += [
+        ("unperturbed", "1", [one.unperturbed for one in several]),
+        ("delay_s", "s", [np.nan if one.own is None else float(one.own.delay) for one in several]),
+        ("misfit", "1", [np.nan if one.misfit is None else one.misfit for one in several]),
         ("dof", "1", [one.dof for one in several]),
         ("explained", "1", [one.explained for one in several]),
         ("held_out", "1", [one.held_out for one in several]),
@@ -226,6 +232,8 @@ def _result(found: ArmImpedance) -> dict[str, Any]:
         "explained_share": found.explained,
         "held_out_share": found.held_out,
         "misfit": found.misfit,
+        "delay_s": None if found.own is None else float(found.own.delay),
+        "improved_inertia_kgm2": np.asarray(found.improved.inertia, float).tolist(),
         "cutoff_hz": None if found.cutoff is None else found.cutoff.tolist(),
         "hand_at_onset_m": found.position.tolist(),
         "angles_at_onset_rad": found.angles.tolist(),
@@ -280,8 +288,9 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "mean place of the hand at the onset": f"{', '.join(f'{x:.3f}' for x in content['hand_at_onset_m'])} m",
         "lengths of the arm": numbers(arm["lengths_m"], "m"),
         f"inertia, {'as given' if arm['inertia_from'] == 'given' else 'from ' + arm['inertia_from']}": inertia,
-        "mass and damping of the handle": f"{numbers(arm['handle_mass_kg'], 'kg')}; "
-        f"{numbers(arm['handle_damping_Ns_per_m'], 'N s/m')}",
+        "mass and damping of the handle": "not stated"
+        if arm["handle_mass_kg"] is None
+        else f"{numbers(arm['handle_mass_kg'], 'kg')}; {numbers(arm['handle_damping_Ns_per_m'], 'N s/m')}",
         "to be trusted, an estimate needs": f"standard errors below {percent(limits['max_relative_stderr'])} of its "
         "matrix, a stiffness and a damping that are not indefinite, "
         + (

@@ -21,15 +21,13 @@ from jaxtyping import Array, Bool, Float, Integer, Num
 from scipy.fft import next_fast_len
 
 from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
-from jaximp.movements import Deviations, Handle, Movements
+from jaximp.movements import VOLUNTARY_DELAY, Deviations, Handle, Movements, cut_at_onset
 from jaximp.objectives import solve_gram
 from jaximp.output_error import output_error
 from jaximp.signals import butterworth, central_differences, filter_zero_phase
 from jaximp.trajectories import array_field
 from jaximp.types import AnyArray, Numbers
 
-VOLUNTARY_DELAY = 0.115
-"""Before that a subject cannot intervene [s]: Börner et al. 2020, 2.1.1."""
 FILTER_ORDER = 10
 LOWEST_CUTOFF = 0.5
 """Below it the spectra are those of the movement and its surroundings [Hz]. A choice."""
@@ -45,9 +43,13 @@ class KnownArm(eqx.Module):
     geometry: ArmGeometry
     inertia: Float[Any, "3"] = array_field()
     """Base inertial parameters of eq. (12) [kg m^2]: those of `static_inertia`, or from anatomy."""
-    handle: Handle = Handle()
+    handle: Handle | None = None
+    """Of the robot: output error and feedback jerk isolation must know what it does."""
     inertia_stderr: Float[Any, "3"] | None = None
     """Their standard errors [kg m^2], where a method can use them."""
+
+    def with_inertia(self, inertia: Num[AnyArray, "3"]) -> KnownArm:
+        return KnownArm(self.geometry, inertia, self.handle, self.inertia_stderr)
 
     @property
     def xi(self) -> Array:
@@ -70,6 +72,12 @@ class Impedance(eqx.Module):
     """Degrees of freedom: a quantile of Student's t with so many makes the intervals."""
     misfit: Float[Array, "*G"]
     """Mean square of the residuals over what was expected: far above one, something is wrong."""
+    converged: Bool[Array, "*G"]
+    """Whether the iteration came to rest within its limits."""
+    delay: Float[Array, "*G"]
+    """Of the motion after the command [s]."""
+    trend: Float[Array, "*G 3"]
+    """How much K11, K12, K22 change over the window, as a share of their middle."""
 
 
 class Isolated(eqx.Module):
@@ -86,13 +94,8 @@ class Isolated(eqx.Module):
 def in_window(movements: Movements, samples: int) -> Movements:
     """The `samples` from each onset on, of which it is the first."""
 
-    def cut(x: Array) -> Array:
-        return jax.vmap(lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, samples))(x, movements.onset)
-
-    x, v, a, force, command = (
-        cut(x)
-        for x in (movements.position, movements.velocity, movements.acceleration, movements.force, movements.command)
-    )
+    signals = (movements.position, movements.velocity, movements.acceleration, movements.force, movements.command)
+    x, v, a, force, command = (cut_at_onset(x, movements.onset, samples) for x in signals)
     return Movements(x, v, a, force, command, jnp.zeros_like(movements.onset), movements.sample_rate)
 
 
@@ -155,11 +158,12 @@ def feedback_jerk_isolation(
 
     **Source:** Börner et al. 2020, 2.2.1, figure 3.
     """
+    handle = _known_handle(arm)
     if cutoff is None:
         if unperturbed is None:
             raise ValueError(
                 "feedback jerk isolation finds its cut-off frequency from unperturbed trials, and there are none: "
-                "pass cutoff=(f1, f2) [Hz], such as (1.9, 2.2), or use another method"
+                "give two cut-off frequencies, cutoff = [f1, f2] in Hz, such as [1.9, 2.2], or use another method"
             )
         cutoff = cutoff_frequencies(perturbed, unperturbed)
     cutoff = np.broadcast_to(np.asarray(cutoff, float), 2)
@@ -168,15 +172,15 @@ def feedback_jerk_isolation(
         filter_zero_phase(butterworth(FILTER_ORDER, float(f), perturbed.sample_rate, "highpass"), of_all[..., axis].T).T
         for axis, f in enumerate(cutoff)
     ]
-    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), arm.handle, _samples(perturbed, window)), cutoff)
+    samples = _samples(perturbed, window)
+    return Isolated(_integrated(perturbed, jnp.stack(high, axis=-1), handle, samples), cutoff)
 
 
 @eqx.filter_jit
 def _integrated(perturbed: Movements, high: Array, handle: Handle, samples: int) -> Deviations:
     """From the jerk of the feedback, over whole trials, to deviations in the window."""
-    cut = eqx.tree_at(lambda m: m.command, perturbed, high)
-    seen = in_window(cut, samples)
-    acceleration = _integral(-seen.command, perturbed.sample_rate)
+    seen = in_window(perturbed, samples)
+    acceleration = _integral(-cut_at_onset(high, perturbed.onset, samples), perturbed.sample_rate)
     velocity = _integral(acceleration, perturbed.sample_rate)
     position = _integral(velocity, perturbed.sample_rate)
     unperturbed = handle.force(jnp.zeros_like(velocity), seen.velocity + velocity, seen.acceleration + acceleration)
@@ -240,11 +244,21 @@ def learned_continuation(
             "(30 or more), or use gomi_kawato"
         )
     fit = output_error(
-        perturbed, unperturbed, arm.geometry, arm.handle, arm.inertia, arm.inertia_stderr, window=window, groups=groups
-    )
+        perturbed, unperturbed, arm.geometry, _known_handle(arm), arm.inertia, arm.inertia_stderr,
+        window=window, groups=groups,
+    )  # fmt: skip
     of_both, dof = fit.covariance[..., :7, :7], fit.dof[..., :7].min(axis=-1)
-    found = (jnp.asarray(x) for x in (fit.D, fit.K, of_both, fit.inertia, dof, fit.chi2))
-    return Isolated(fit.deviations, impedance=Impedance(*found))
+    found = (fit.D, fit.K, of_both, fit.inertia, dof, fit.chi2, fit.converged, fit.delay, fit.kappa[..., 4:])
+    return Isolated(fit.deviations, impedance=Impedance(*map(jnp.asarray, found)))
+
+
+def _known_handle(arm: KnownArm) -> Handle:
+    if arm.handle is None:
+        raise ValueError(
+            "this method must know the mass and the damping that the robot gives its handle: state them in "
+            "[trials.handle] of a job, or as KnownArm(handle=...), or use gomi_kawato"
+        )
+    return arm.handle
 
 
 def _samples(movements: Movements, window: float) -> int:
@@ -372,11 +386,13 @@ class Method(NamedTuple):
     """Whether it wants position and force smoothed as the derivatives are (`read_movements`), or as measured."""
     estimates: bool = False
     """Whether it estimates the impedance itself, of `groups` of trials."""
+    at_rest: bool = False
+    """Whether it takes the unperturbed hand to be at rest."""
 
 
 METHODS = {
     "output_error": Method("OE", "output error (this project)", learned_continuation, smooth=False, estimates=True),
     "feedback_jerk": Method("FJI", "feedback jerk isolation (Börner et al. 2020)", feedback_jerk_isolation),
     "gomi_kawato": Method("GOM", "mean of all perturbed trials (Gomi and Kawato 1997)", mean_of_perturbed, True),
-    "erden_billard": Method("ERD", "state at the onset (Erden and Billard 2015)", state_at_onset),
+    "erden_billard": Method("ERD", "state at the onset (Erden and Billard 2015)", state_at_onset, at_rest=True),
 }

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp.models import ArmGeometry
-from jaximp.movements import Handle, Movements
+from jaximp.movements import HISTORY, VOLUNTARY_DELAY, Handle, Movements
 from jaximp.signals import (
+    butterworth,
     fill_gaps,
+    filter_zero_phase,
     noise_level,
     quantisation_step,
     require_float64,
@@ -36,17 +38,15 @@ SILENT = 0.01
 """A command that stays below such a share of the largest one of all trials is none."""
 FLAT = 0.05
 """Smallest over largest singular value of the perturbations from which on they span the plane."""
-BEFORE = 0.3
-"""What every movement must have before its onset [s]: reflexes and filters reach back from there."""
 MARGIN = 0.05
 """What every movement must have after its window [s], for the filters of what comes next."""
 APPROACH = 0.1
 """The hand's way in so many seconds before the onset is the direction of the movement."""
-VOLUNTARY_DELAY = 0.115
-"""Earliest voluntary answer to a perturbation [s]: Börner et al. 2020."""
 WIDER = 2.0
 """Cut-off of the differentiator over that of the smoothing before it: the smoothing decides. (It leaves 99.1 % of the
 acceleration at 40 Hz, with 1.3 times the noise of a differentiator of one stage, and 1.4 times in the jerk.)"""
+SLOW = 10.0
+"""Up to which force, command and motion are compared [Hz]."""
 LOUD = 0.1
 """Noise of such a share of what the perturbations make of a derivative spoils what needs it: a choice."""
 
@@ -68,20 +68,19 @@ class SensorNoise:
     share_of_force: float
 
     def in_words(self) -> tuple[str, ...]:
-        """One line each for jerk, acceleration and force."""
+        """One line for each of jerk, acceleration and force that noise spoils; or one that says that there is none."""
         unit = {"position": "m", "velocity": "m/s", "acceleration": "m/s^2"}[self.source]
         level = f"{1e6 * self.level:.3g} um" if unit == "m" else f"{self.level:.2g} {unit}"
         steps = f" (an encoder in steps of {1e6 * self.step:.3g} um)" if self.step else ""
         noise = f"the {self.source}'s noise of {level}{steps} makes"
-        jerk, acceleration = self.share_of_jerk, self.share_of_acceleration
-        return (
-            f"{noise} {_percent(jerk)} of the jerk of the perturbations: "
-            + ("feedback jerk isolation will not work; use output error" if jerk > LOUD else "little enough for all"),
-            f"{noise} {_percent(acceleration)} of their acceleration: "
-            + ("estimates from it are biased; use output error" if acceleration > LOUD else "little enough"),
-            f"the force's noise of {self.force:.2g} N is {_percent(self.share_of_force)} of what they change the force "
-            + ("by: perturb harder, or more often" if self.share_of_force > LOUD else "by: little enough"),
+        jerk = f"{noise} {{}} of the perturbations' jerk: feedback jerk isolation will not work; use output error"
+        acceleration = f"{noise} {{}} of their acceleration: estimates from it are biased; use output error"
+        force = (
+            f"the force's noise of {self.force:.2g} N is {{}} of what they change it by: perturb harder, or more often"
         )
+        shares = ((self.share_of_jerk, jerk), (self.share_of_acceleration, acceleration), (self.share_of_force, force))
+        words = tuple(text.format(_percent(share)) for share, text in shares if share > LOUD)
+        return words or (f"{noise} {_percent(self.share_of_jerk)} of the jerk of the perturbations: little enough",)
 
 
 def _percent(share: float) -> str:
@@ -140,7 +139,7 @@ def read_movements(
     if not any(trial.perturbed for trial in trials):
         raise ValueError("no trial is perturbed: all commands stay at zero; map the perturbing force as the command")
     _align(trials, trigger)
-    kept = _common_length(trials, (BEFORE, window + MARGIN), before, after)
+    kept = _common_length(trials, (HISTORY, window + MARGIN), before, after)
     groups = [[trial for trial in trials if trial.perturbed is wanted] for wanted in (True, False)]
     check_directions(_pushes(groups[0], max(2, round(window * rate))), f"{len(groups[0])} perturbed trials")
     measured = [_movements(group, kept, False) for group in groups]
@@ -178,7 +177,7 @@ def read_postures(
     trials = []
     for name, recording, at in zip(names, recordings, given, strict=True):
         first = find_onset(name, recording) if np.isnan(at) else _sample(recording, at)
-        trials.append(_Trial(name, recording, first, filters, Handle(), at_rest=True))
+        trials.append(_Trial(name, recording, first, filters, None, at_rest=True))
     kept = _common_length(trials, (filters.half / rate, MARGIN), before, after)
     postures = _movements(trials, kept, smooth)
     assert postures is not None
@@ -311,7 +310,7 @@ def _check_beginning(name: str, command: Numbers, largest: float) -> None:
     """A command that has begun when the recording does would pass for its own steady state."""
     if np.abs(_leading(command) - np.nanmedian(command, axis=0)).max() > 0.1 * largest > 0:
         raise ValueError(
-            f"{name}: its command is not at rest when the recording begins; record at least {BEFORE:g} s before the "
+            f"{name}: its command is not at rest when the recording begins; record at least {HISTORY:g} s before the "
             "onset, or leave it out"
         )
 
@@ -588,7 +587,7 @@ def _check_recordings(recordings: Sequence[Recording], geometry: ArmGeometry | N
 def _check_kept(before: float | None, after: float | None, window: float) -> None:
     if not 0 <= window < np.inf:
         raise ValueError(f"window is {window:g} s: it must be zero or more")
-    least = (BEFORE, window + MARGIN) if window else (0.0, 0.0)
+    least = (HISTORY, window + MARGIN) if window else (0.0, 0.0)
     for name, given, low in zip(("before", "after"), (before, after), least, strict=True):
         if given is not None and not low <= given < np.inf:
             raise ValueError(f"{name} is {given:g} s: at least {low:.3g} s are needed")
@@ -602,6 +601,38 @@ def window_warning(window: float) -> str:
         f"the window of {1e3 * window:.4g} ms is longer than the voluntary delay of {1e3 * VOLUNTARY_DELAY:g} ms: "
         "the estimates are those of an arm that may already answer at will"
     )
+
+
+def handle_disagreement(perturbed: Movements, handle: Handle | None) -> tuple[float, str]:
+    """Share by which the recorded force differs from the one that handle and command make, apart from an offset, and
+    what to do about it.
+
+    The recordings themselves tell the mass and the damping, since `command - force = mass a + damping v` (eq. (25) of
+    Börner et al. 2020): at low frequencies, which all filters leave alone.
+    """
+    if handle is None or not np.isfinite(np.asarray(perturbed.command)).all():
+        return 0.0, ""
+    slow = butterworth(2, SLOW, perturbed.sample_rate)
+    signals = (perturbed.velocity, perturbed.acceleration, perturbed.force, perturbed.command)
+    v, a, force, command = (np.asarray(filter_zero_phase(slow, jnp.moveaxis(x, 1, 0))).reshape(-1, 2) for x in signals)
+    difference = force - np.asarray(handle.force(command, v, a))
+    off = _rms(difference - difference.mean(axis=0)) / _rms(force)
+    columns = [np.stack([a[:, k], v[:, k], np.ones(len(a))], axis=1) for k in (0, 1)]
+    seen = [np.linalg.lstsq(W, (command - force)[:, k])[0] for k, W in enumerate(columns)]
+    left = np.stack([(command - force)[:, k] - W @ seen[k] for k, W in enumerate(columns)], axis=1)
+    mass, damping, offset = (", ".join(f"{x:.3g}" for x in values) for values in zip(*seen, strict=True))
+    explained = _rms(left) < off * _rms(force) / 3
+    return off, f"the recorded force differs by {100 * off:.3g} % from what command and handle make: " + (
+        f"by the recordings, the handle has a mass of {mass} kg and a damping of {damping} N s/m (and the force "
+        f"an offset of {offset} N); correct [trials.handle], or the force"
+        if explained
+        else "no mass and damping explain it; check the sign and the unit of force and command, and whether force, "
+        "command and position are of one instant"
+    )
+
+
+def _rms(x: Numbers) -> float:
+    return float(np.sqrt((x**2).mean()))
 
 
 def _notes(trials: list[_Trial], window: float) -> tuple[str, ...]:

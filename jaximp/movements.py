@@ -5,11 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Num
 
 from jaximp.trajectories import array_field
 from jaximp.types import AnyArray
+
+VOLUNTARY_DELAY = 0.115
+"""Before that a subject cannot intervene [s]: Börner et al. 2020, 2.1.1."""
+HISTORY = 0.3
+"""What a method may look at before the onset [s]: it predicts the movement, and reflexes and filters reach back."""
 
 
 class Handle(eqx.Module):
@@ -19,9 +25,9 @@ class Handle(eqx.Module):
     perturbation: Börner et al. 2020, eqs. (25), (26).
     """
 
-    mass: Float[Any, "2"] = array_field(default=(5.0, 5.0))
+    mass: Float[Any, "2"] = array_field()
     """Of the admittance, along both axes [kg]."""
-    damping: Float[Any, "2"] = array_field(default=(20.0, 20.0))
+    damping: Float[Any, "2"] = array_field()
     """Of the admittance [N s/m]."""
     own_mass: Float[Any, ""] = array_field(default=0.0)
     """Between force sensor and hand [kg]; nothing where the force is computed and not measured."""
@@ -54,6 +60,12 @@ class Movements(eqx.Module):
 
     def __len__(self) -> int:
         return self.position.shape[0]
+
+
+@eqx.filter_jit
+def cut_at_onset(x: Num[Array, "T N 2"], onset: Int[Array, " T"], samples: int) -> Float[Array, "T {samples} 2"]:
+    """The `samples` of a signal from each onset on, of which it is the first."""
+    return jax.vmap(lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, samples))(x, onset)
 
 
 class Deviations(eqx.Module):

@@ -6,8 +6,8 @@ commanded force is simulated; and the impedance is found for which
     measured motion = predicted motion - simulated deviation,
 
 weighted by what the prediction cannot know. (Deviations are unperturbed less perturbed.) The source of all of it is
-this project. Everything is measured in bins of 5 ms, in which f is the past of a trial, 300 ms up to its onset, and g
-what follows in the window.
+this project. Everything is measured in bins of 5 ms, in which f is the past of a trial, 300 ms up to its onset (with
+5 ms the error of K11 is four times as large), and g what follows in the window.
 
 **Prior.** Over n unperturbed trials aligned at their onsets, z = [f, g] has mean m and covariance S. The same trials
 aligned anew where they cross other lines, up to 100 ms before and 50 ms after, and the perturbed trials where they
@@ -40,8 +40,9 @@ residuals R of trials that the prediction had not seen, with X_i = Z_i S_i less 
 
     cov = G^-1 [ sum Z_i E Z_i' + (sum Z_i) E/n (sum Z_i)' + sum X_i diag(spread)^2 X_i' + P ] G^-1.
 
-So the interval is about the mean impedance of the group's own trials, and about the middle of the window (which for a
-linear course is its mean). Groups of one experiment share prior and inertia: their errors are not independent.
+It is multiplied by chi2 where that is above one. So the interval is about the mean impedance of the group's own trials,
+and about the middle of the window (which for a linear course is its mean). Groups of one experiment share prior and
+inertia: their errors are not independent.
 
 **Limits.** All numbers of this project for it are from a simulation whose arm is the fitted model: rigid, linear in the
 window, noise that ends steeply at 2 Hz, no soft tissue, no drift, no fatigue, and the commanded force is really
@@ -64,14 +65,12 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import t as student
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
-from jaximp.movements import Deviations, Handle, Movements
+from jaximp.movements import HISTORY, VOLUNTARY_DELAY, Deviations, Handle, Movements
 from jaximp.signals import require_float64
 from jaximp.types import AnyArray, Numbers
 
 BIN = 0.005
 """What positions are averaged over [s]."""
-HISTORY = 0.3
-"""Of the movement before the onset that predicts it [s]. With 5 ms the error of K11 is four times as large."""
 REALIGNED = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05)
 """Where unperturbed trials are aligned anew [s]: at the line where they are this long after the onset."""
 REALIGNED_BEFORE = (0.0, -0.015)
@@ -79,7 +78,7 @@ REALIGNED_BEFORE = (0.0, -0.015)
 BORROWED = 60
 """N: how many trials the windows aligned anew are worth together."""
 FOLDS = 10
-FEWEST_TRIALS = 5
+FEWEST_UNPERTURBED = 5
 """Unperturbed, from which a mean and its residuals can be told."""
 RESOLUTION = 3e-7
 """Least s [m]: the rounding of an encoder of 1 um. Smaller is better only in simulations."""
@@ -99,11 +98,12 @@ ITERATIONS = 8
 """At most."""
 SMALL_STEP = 0.05
 """In standard errors, of D and K: the iteration ends."""
-DELAYS = 0.01
-"""Largest delay that can be found [s]."""
+DELAYS = 0.009
+"""Largest delay of the motion after the command that can be found [s]. Motion that is ahead of its command has begun at
+the onset, which the fit cannot know: up to 1 ms it does little harm, and more is a misfit."""
 STEP = 1 / 4000
 """Of the integration, at most [s]: twice as long a one biases the deviation by 0.2 %."""
-MISFIT = 2.0
+MISFIT = 1.5
 """chi2 above which a fit is not ok."""
 
 PAIRS = np.array([0, 1, 1, 2])
@@ -131,12 +131,17 @@ class OutputErrorFit(eqx.Module):
     chi2: Float[Any, "*G"]
     """Weighted sum of squares of the residuals over what is expected of it: about 1, or less where trials differ less
     than `SPREAD` allows."""
-    ok: Bool[Any, "*G"]
-    """Whether the iteration came to rest, all is finite and chi2 is at most `MISFIT`."""
+    converged: Bool[Any, "*G"]
+    """Whether the iteration came to rest, with a delay within its limits, and all is finite."""
     residual: Float[Any, "T B 2"]
     """Predicted less measured motion less deviation, bin by bin [m], for the parameters of all trials together."""
     deviations: Deviations
     """As simulated with the parameters of all trials together."""
+
+    @property
+    def ok(self) -> Any:
+        """(*G,) whether it converged, and chi2 is at most `MISFIT`."""
+        return np.asarray(self.converged) & (np.asarray(self.chi2) <= MISFIT)
 
     @property
     def stderr(self) -> Numbers:
@@ -159,7 +164,7 @@ def output_error(
     inertia: Num[AnyArray, "3"],
     inertia_stderr: Num[AnyArray, "3"] | None = None,
     *,
-    window: float = 0.115,
+    window: float = VOLUNTARY_DELAY,
     sensor_noise: float = 0.0,
     groups: Integer[AnyArray, "G m"] | None = None,
 ) -> OutputErrorFit:
@@ -186,7 +191,12 @@ def output_error(
     known = _Known.of(inertia, inertia_stderr)
     chosen = _members(groups, len(perturbed))
     noise = float(sensor_noise) / np.sqrt(bins.width)
-    prior = learn_continuation(unperturbed, perturbed, window, noise)
+    try:
+        prior = learn_continuation(unperturbed, perturbed, window, noise)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the unperturbed trials have no covariance that makes sense: are some of them copies, or in other units?"
+        ) from None
     lanes = _in_lanes(perturbed, geometry, handle, bins)
     past, measured = _flat(_binned(perturbed, bins.before, 0, bins)), _flat(_binned(perturbed, 0, bins.after, bins))
     target = prior.predict(past) - measured
@@ -211,7 +221,7 @@ def output_error(
         covariance=found.covariance,
         dof=found.dof,
         chi2=found.chi2,
-        ok=np.isfinite(theta_of).all(axis=-1) & (found.chi2 <= MISFIT) & rest,
+        converged=np.isfinite(theta_of).all(axis=-1) & rest & (np.abs(theta_of[..., DELAY]) < DELAYS),
         residual=linear.r.reshape(len(perturbed), -1, 2),
         deviations=_full_rate(jnp.asarray(theta), lanes, geometry, handle, perturbed),
     )
@@ -259,7 +269,7 @@ class Continuation(NamedTuple):
 
 
 def learn_continuation(
-    unperturbed: Movements, perturbed: Movements, window: float = 0.115, noise: float = 0.0
+    unperturbed: Movements, perturbed: Movements, window: float = VOLUNTARY_DELAY, noise: float = 0.0
 ) -> Continuation:
     """How a movement goes on after its onset, from unperturbed trials and from what precedes the perturbation.
 
@@ -347,7 +357,7 @@ class _Lanes(eqx.Module):
     carried: Float[Array, "S 2 T"]
     """Torque that the handle's own mass and damping take [N m]."""
     command: Float[Array, "S_and_delays 2 T"]
-    """[N], from `DELAYS` before to as long after."""
+    """[N], from a little more than `DELAYS` before to as long after."""
     rate: float = eqx.field(static=True)
     """[Hz]"""
     finer: int = eqx.field(static=True)
@@ -359,7 +369,7 @@ class _Lanes(eqx.Module):
 def _in_lanes(perturbed: Movements, geometry: ArmGeometry, handle: Handle, bins: _Bins) -> _Lanes:
     rate, onset = perturbed.sample_rate, np.asarray(perturbed.onset)
     finer = int(np.ceil(1 / (rate * STEP) - 1e-9))
-    room = int(np.ceil(DELAYS * rate))
+    room = int(np.ceil((DELAYS + 0.001) * rate - 1e-9))
 
     def cut(x: Any, first: int, last: int) -> Numbers:
         """(S, 2, T), with new samples between the old by a cubic spline."""
@@ -503,7 +513,7 @@ class _Known(NamedTuple):
     def within(self, theta: Numbers) -> Numbers:
         """Where the arm can be simulated: trials that no impedance explains lead the iteration anywhere."""
         limit = np.full(18, np.inf)
-        limit[:7], limit[KAPPA], limit[DELAY] = 10 * self.start[:7], 2.0, 0.9 * DELAYS
+        limit[:7], limit[KAPPA], limit[DELAY] = 10 * self.start[:7], 2.0, DELAYS
         low, high = -limit, limit
         low[INERTIA], high[INERTIA] = self.start[INERTIA] / 2, 2 * self.start[INERTIA]
         return np.clip(theta, low, high)
@@ -571,7 +581,8 @@ class _Linear(NamedTuple):
             + inverse @ known.P @ inverse
         )
         dof = 2 * n * np.diag(covariance) ** 2 / np.maximum(added.var(axis=0), 1e-300)
-        return _Step(self.theta + step, covariance, dof, np.asarray(self._chi2(members, step, Z, inverse)))
+        chi2 = self._chi2(members, step, Z, inverse)
+        return _Step(self.theta + step, covariance * max(1.0, chi2), dof, np.asarray(chi2))
 
     def _chi2(self, members: np.ndarray, step: Numbers, Z: Numbers, inverse: Numbers) -> float:
         """Sum of squares of the residuals of a group over its expectation, less what the fit takes of it."""
@@ -609,10 +620,10 @@ def _check(perturbed: Movements, unperturbed: Movements, bins: _Bins) -> None:
     for name, movements in (("perturbed", perturbed), ("unperturbed", unperturbed)):
         _check_shapes(name, movements)
         _check_room(name, movements, bins)
-    if len(unperturbed) < FEWEST_TRIALS:
+    if len(unperturbed) < FEWEST_UNPERTURBED:
         raise ValueError(
-            f"{len(unperturbed)} unperturbed trials cannot tell how a movement goes on: at least {FEWEST_TRIALS} are "
-            "needed, and 30 or more are much better"
+            f"{len(unperturbed)} unperturbed trials cannot tell how a movement goes on: at least "
+            f"{FEWEST_UNPERTURBED} are needed, and 30 or more are much better"
         )
     still = np.flatnonzero(~_in_use(perturbed, bins, perturbed.command).any(axis=(1, 2)))
     if still.size:

@@ -31,8 +31,8 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.models import ArmGeometry
-from jaximp.movement_trials import VOLUNTARY_DELAY, read_movements, read_postures
-from jaximp.movements import Handle, Movements
+from jaximp.movement_trials import read_movements, read_postures
+from jaximp.movements import VOLUNTARY_DELAY, Handle, Movements
 from jaximp.readers import FORMATS
 from jaximp.recordings import check_mapping, load_recording, load_trial_table
 from jaximp.settings import check_keys, settings
@@ -40,8 +40,6 @@ from jaximp.types import Recording, nearest
 
 TASKS = ("movement", "posture")
 """What the subject does: move and be perturbed at times, or keep a posture."""
-METHOD_NAMES = ("output_error", "feedback_jerk", "gomi_kawato", "erden_billard")
-"""What impedance can be identified by."""
 STATIC_WINDOW = 0.4
 """After the onset of a perturbed posture, from which the inertia is estimated [s]."""
 _POSTURE = ("files", "file", "trial", "onset", "window")
@@ -56,9 +54,9 @@ _FIXED = ("joint", "gear_ratio", "name", "force")
 class HandleSettings:
     """`[trials.handle]`: the admittance of the handle, as in `Handle`."""
 
-    mass: list[float] = field(default_factory=lambda: [5.0, 5.0])
+    mass: list[float]
     """Along both axes [kg]."""
-    damping: list[float] = field(default_factory=lambda: [20.0, 20.0])
+    damping: list[float]
     """[N s/m]"""
     own_mass: float = 0.0
     """Between force sensor and hand [kg]."""
@@ -103,7 +101,7 @@ class TrialsSettings:
     task: str = "movement"
     """One of `TASKS`."""
     method: str | list[str] = "output_error"
-    """One of `METHOD_NAMES`, or several: the first makes the report, the others stand beside it."""
+    """One of `isolation.METHODS`, or several: the first makes the report, the others stand beside it."""
     window: float = VOLUNTARY_DELAY
     """After the onset, from which impedance is estimated [s]."""
     cutoff: list[float] | None = None
@@ -111,7 +109,8 @@ class TrialsSettings:
     onset: float | list[float] | None = None
     """Of the perturbation [s], in each trial's own time; `nan` for an unperturbed one. Else found in the command."""
     trigger: TriggerSettings | None = None
-    handle: HandleSettings = field(default_factory=HandleSettings)
+    handle: HandleSettings | None = None
+    """Some methods must know it."""
     files: str | list[str] | None = None
     """One file a trial: a name, a pattern, a folder, or a list of these."""
     file: str | None = None
@@ -161,8 +160,9 @@ class TrialsSettings:
             postures, notes = read_postures(recordings, onset=self.onset, geometry=geometry, smooth=smooth)
             return postures, None, notes
         trigger = None if self.trigger is None else (self.trigger.axis - 1, self.trigger.position)
+        handle = None if self.handle is None else self.handle.make()
         return read_movements(
-            recordings, window=self.window, onset=self.onset, trigger=trigger, handle=self.handle.make(),
+            recordings, window=self.window, onset=self.onset, trigger=trigger, handle=handle,
             geometry=geometry, smooth=smooth,
         )  # fmt: skip
 
@@ -222,8 +222,8 @@ def arm_settings(table: Any) -> HandArmSettings:
     arm.geometry()  # refuses lengths that cannot be
     for name in ("inertia", "inertia_stderr"):
         values = getattr(arm, name)
-        if values is not None and (len(values) != 3 or not all(x >= 0 and math.isfinite(x) for x in values)):
-            raise ValueError(f"model.arm.{name} is {values}: it must be three numbers of at least zero, in kg m^2")
+        if values is not None and (len(values) != 3 or not all(x > 0 and math.isfinite(x) for x in values)):
+            raise ValueError(f"model.arm.{name} is {values}: it must be three numbers above zero, in kg m^2")
     if arm.inertia_stderr is not None and arm.inertia is None:
         raise ValueError("model.arm.inertia_stderr needs model.arm.inertia: add it")
     return arm
@@ -237,19 +237,19 @@ def _check_files(trials: TrialsSettings, table: Mapping[str, Any], where: str) -
 
 
 def _check_values(trials: TrialsSettings) -> None:
-    given = [("task", trials.task, TASKS), *(("method", method, METHOD_NAMES) for method in trials.methods)]
-    for name, value, choices in given:
-        if value not in choices:
-            raise ValueError(f"trials.{name} is '{value}': {nearest(value, list(choices))}")
+    if trials.task not in TASKS:
+        raise ValueError(f"trials.task is '{trials.task}': {nearest(trials.task, list(TASKS))}")
     if not trials.methods or len(set(trials.methods)) < len(trials.methods):
         raise ValueError(f"trials.method is {list(trials.methods)}: name at least one, and each once")
-    pairs = {"cutoff": trials.cutoff, "handle.mass": trials.handle.mass, "handle.damping": trials.handle.damping}
+    pairs = {"cutoff": trials.cutoff}
+    if trials.handle is not None:
+        pairs |= {"handle.mass": trials.handle.mass, "handle.damping": trials.handle.damping}
+        if not (trials.handle.own_mass >= 0 and math.isfinite(trials.handle.own_mass)):
+            raise ValueError(f"trials.handle.own_mass is {trials.handle.own_mass}: it must be zero or more, in kg")
     for name, pair in pairs.items():
         if pair is not None and (len(pair) != 2 or not all(x > 0 and math.isfinite(x) for x in pair)):
             raise ValueError(f"trials.{name} is {pair}: it must be two numbers above zero")
     _check_window(trials.window, "trials")
-    if not (trials.handle.own_mass >= 0 and math.isfinite(trials.handle.own_mass)):
-        raise ValueError(f"trials.handle.own_mass is {trials.handle.own_mass}: it must be zero or more, in kg")
     if trials.trigger is not None and trials.trigger.axis not in (1, 2):
         raise ValueError(f"trials.trigger.axis is {trials.trigger.axis}: it must be 1 or 2")
 

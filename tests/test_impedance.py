@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
@@ -19,7 +20,8 @@ from jaximp.impedance import ArmImpedance, at_other_windows, identify_impedance,
 from jaximp.isolation import METHODS, Deviations, Impedance, Isolated, JointDeviations, KnownArm, Method
 from jaximp.job import parse_job, read_job
 from jaximp.models import ArmGeometry
-from jaximp.movements import Movements
+from jaximp.movement_trials import handle_disagreement
+from jaximp.movements import Handle, Movements
 from jaximp.trust import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
 
 NASTY = "<script>alert(1).csv"
@@ -185,14 +187,100 @@ def test_inertia_must_be_known(arm: Path, capsys: pytest.CaptureFixture[str]) ->
     refused(arm, alone + text[end:], "a job of postures alone", capsys)
 
 
-def test_given_inertia_without_errors_is_a_warning(arm: Path) -> None:
-    text = (arm / "job.toml").read_text()
+@pytest.fixture(scope="module")
+def enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Simulated recordings from which output error learns enough."""
+    folder = tmp_path_factory.mktemp("simulated") / "arm"
+    assert jaximp("simulate", "arm", "--out", folder, "--perturbed", 16, "--unperturbed", 32) == 0
+    return folder
+
+
+def test_the_method_that_comes_with_the_job_finds_the_truth(enough: Path) -> None:
+    truth = json.loads((enough / "truth.json").read_text())
+    assert jaximp("identify", enough / "job.toml", "--out", enough / "out") == 0
+    found = json.loads((enough / "out" / "summary.json").read_text())
+    assert (found["method"], found["verdict"], found["warnings"]) == ("output_error", TRUSTED, [])
+    K, D = (np.array(truth[name]) for name in ("stiffness_Nm_per_rad", "damping_Nms_per_rad"))
+    np.testing.assert_allclose(found["stiffness_Nm_per_rad"], K, atol=0.05 * K.max())
+    np.testing.assert_allclose(found["damping_Nms_per_rad"], D, atol=0.05 * D.max())
+    np.testing.assert_allclose(found["improved_inertia_kgm2"], truth["inertia_kgm2"], rtol=0.05)
+    assert abs(found["delay_s"]) < 1e-5
+    row = pq.read_table(enough / "out" / "estimates.parquet").to_pylist()[0]
+    assert (row["unperturbed"], row["misfit"]) == (32, found["misfit"])
+
+
+def test_given_inertia_without_errors_is_a_warning(enough: Path) -> None:
+    text = (enough / "job.toml").read_text()
     start, end = text.index("[trials.posture]"), text.index("[model.arm]")
-    job = parse_job(text[:start] + text[end:] + "inertia = [0.1945, 0.0737, 0.0838]\n", arm)
+    job = parse_job(text[:start] + text[end:] + "inertia = [0.1945, 0.0737, 0.0838]\n", enough)
     found = identify_trials(job)
     assert found.static is None
     assert any("given without standard errors" in warning for warning in found.main.warnings)
     assert found.main.inertia_stderr is None
+
+
+def lagging(milliseconds: float) -> Callable[[Movements], Movements]:
+    """The command was written down so much too early."""
+    return lambda m: eqx.tree_at(
+        lambda m: m.command, m, jnp.roll(m.command, -round(milliseconds * m.sample_rate / 1e3), axis=1)
+    )
+
+
+SPOILT: dict[str, tuple[Callable[[Movements], Movements], Handle, str]] = {
+    "another damping": (lambda m: m, Handle((5.0, 5.0), (10.0, 10.0)), "a mass of 5, 5 kg and a damping of 20, 20"),
+    "another mass": (lambda m: m, Handle((5.0, 6.0), (20.0, 20.0)), "the handle has a mass of 5, 5 kg"),
+    "force of the other sign": (
+        lambda m: eqx.tree_at(lambda m: m.force, m, -m.force), Handle((5.0, 5.0), (20.0, 20.0)), "check the sign",
+    ),
+    "command 4 ms late": (lagging(-4.0), Handle((5.0, 5.0), (20.0, 20.0)), "are of one instant"),
+    "command 4 ms early": (lagging(4.0), Handle((5.0, 5.0), (20.0, 20.0)), "are of one instant"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_force_command_and_handle_must_agree(enough: Path, case: str) -> None:
+    """Output error does not look at the force, and would believe a handle of another damping."""
+    spoil, handle, reason = SPOILT[case]
+    perturbed, unperturbed, _ = movements_of(enough)
+    known = KnownArm(GEOMETRY, ARM.inertia, handle)
+    found = identify_impedance(spoil(perturbed), unperturbed, known, "gomi_kawato")
+    assert (found.verdict, found.trusted) == (POOR, False)
+    assert reason in found.reason
+    assert identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), "gomi_kawato").trusted
+
+
+def movements_of(folder: Path) -> tuple[Movements, Movements | None, tuple[str, ...]]:
+    trials = read_job(folder / "job.toml").trials
+    assert trials is not None
+    return trials.load()
+
+
+def test_a_handle_that_is_a_little_wrong_is_a_warning(enough: Path) -> None:
+    perturbed, unperturbed, _ = movements_of(enough)
+    known = KnownArm(GEOMETRY, ARM.inertia, Handle((5.0, 5.0), (19.2, 19.2)))
+    found = identify_impedance(perturbed, unperturbed, known, "gomi_kawato")
+    assert found.trusted
+    assert any("a damping of 20, 20 N s/m" in warning for warning in found.warnings)
+
+
+def test_an_offset_of_the_force_sensor_is_no_disagreement(enough: Path) -> None:
+    perturbed, _, _ = movements_of(enough)
+    moved = eqx.tree_at(lambda m: m.force, perturbed, perturbed.force + jnp.array([3.0, -2.0]))
+    assert handle_disagreement(moved, Handle((5.0, 5.0), (20.0, 20.0)))[0] < 0.01
+
+
+@pytest.mark.parametrize("method", ["output_error", "feedback_jerk"])
+def test_methods_ask_for_the_handle(enough: Path, method: str) -> None:
+    perturbed, unperturbed, _ = movements_of(enough)
+    with pytest.raises(ValueError, match=r"state them in \[trials.handle\] of a job, or as KnownArm"):
+        identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), method)
+
+
+def test_a_moving_hand_does_not_pass_for_one_at_rest(enough: Path) -> None:
+    perturbed, unperturbed, _ = movements_of(enough)
+    found = identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), "erden_billard")
+    assert found.verdict == POOR
+    assert re.search(r"moves at 0\.\d+ m/s at the onset, [\d.]+ mm in the window.*use output_error", found.reason)
 
 
 def test_postures_inherit_columns() -> None:
@@ -303,10 +391,20 @@ def of_trials(matrix: np.ndarray, spread: float, trials: int = 10) -> np.ndarray
     return matrix * (1 + spread * np.where(np.arange(trials) % 2, 1, -1))[:, None, None]
 
 
-def own(D: np.ndarray = D, K: np.ndarray = K, error: float = 0.02, dof: float = 30.0, misfit: float = 1.0) -> Impedance:
+def own(
+    D: np.ndarray = D,
+    K: np.ndarray = K,
+    error: float = 0.02,
+    dof: float = 30.0,
+    misfit: float = 1.0,
+    converged: bool = True,
+    delay: float = 0.0,
+    trend: float = 0.0,
+) -> Impedance:
     """What a method of its own says."""
     sizes = np.array([2.4] * 4 + [29.0] * 3)
-    return Impedance(*map(jnp.asarray, (D, K, np.diag((error * sizes) ** 2), ARM.inertia, dof, misfit)))
+    found = (D, K, np.diag((error * sizes) ** 2), ARM.inertia, dof, misfit, converged, delay, np.full(3, trend))
+    return Impedance(*map(jnp.asarray, found))
 
 
 LOOSE = TrustLimits(max_relative_stderr=100.0)
@@ -335,6 +433,9 @@ CASES: dict[str, tuple[dict[str, Any], str, str]] = {
     "own, few": ({"own": own(dof=2.0)}, WEAK, "2 degrees of freedom are too few"),
     "own, indefinite": ({"own": own(K=INDEFINITE)}, POOR, "indefinite stiffness"),
     "own, failed": ({"own": own(K=K * np.nan)}, NO_DATA, "a number is not finite"),
+    "own, restless": ({"own": own(converged=False)}, POOR, "did not converge: shorten the window"),
+    "own, late": ({"own": own(converged=False, delay=0.01)}, POOR, "lag its command by 9 ms or more: record force and"),
+    "own, misfit and loud": ({"own": own(error=0.4, misfit=1.7)}, POOR, "1.7 times"),
     "own, without errors": ({"own": own(error=np.nan)}, WEAK, "cannot be judged"),
 }
 
@@ -356,6 +457,13 @@ def test_half_of_the_trials_must_predict_the_others(identified: Identify) -> Non
     judged = identified(**options, limits=between)
     assert judged.verdict == POOR
     assert "half of the trials predicts" in judged.reason
+
+
+def test_limits_of_output_error_are_said(identified: Identify) -> None:
+    found = identified(own=own(trend=-0.6))
+    assert found.trusted
+    assert any("0 unperturbed movements teach little" in warning for warning in found.warnings)
+    assert any("change by 60 % within the window" in warning for warning in found.warnings)
 
 
 def test_warnings_leave_the_verdict(identified: Identify) -> None:

@@ -156,7 +156,7 @@ def test_noise_free_jerk_isolation_is_nearly_exact() -> None:
 
 
 def test_jerk_isolation_without_unperturbed_trials_needs_its_cutoff(experiment: Experiment) -> None:
-    with pytest.raises(ValueError, match="pass cutoff="):
+    with pytest.raises(ValueError, match=r"cutoff = \[f1, f2\] in Hz"):
         feedback_jerk_isolation(experiment.perturbed, None, KNOWN)
     given = feedback_jerk_isolation(experiment.perturbed, None, KNOWN, cutoff=np.array([1.9, 2.2]))
     assert shares(experiment, given.deviations)[0] < 3

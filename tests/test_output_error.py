@@ -138,8 +138,8 @@ def test_one_group_has_no_leading_axis(trials: Trials, fit: OutputErrorFit) -> N
     assert (alone.stderr[4:7] < fit.stderr[:, 4:7]).all()
 
 
-@pytest.mark.parametrize("late", [-3, 2])
-def test_a_late_command_is_found(trials: Trials, late: int) -> None:
+@pytest.mark.parametrize("late", [-3, 2, 32])
+def test_motion_that_lags_its_command_is_found(trials: Trials, late: int) -> None:
     early = eqx.tree_at(lambda m: m.command, trials.perturbed, np.roll(trials.perturbed.command, -late, axis=1))
     fit = fit_of(eqx.tree_at(lambda t: t.perturbed, trials, early))
     assert abs(fit.delay - late / RATE) < 2e-5

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaximp.impedance import ArmImpedance, OtherWindows
-from jaximp.isolation import METHODS, VOLUNTARY_DELAY
+from jaximp.isolation import METHODS
+from jaximp.movements import VOLUNTARY_DELAY
 from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, pretty_unit, styled
 from jaximp.types import Numbers
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque, solve_pair
-from jaximp.movements import Handle, Movements
+from jaximp.movements import VOLUNTARY_DELAY, Handle, Movements
 from jaximp.signals import butterworth, filter_from_zero
 from jaximp.trajectories import MinimumJerk, RaisedSine, array_field
 from jaximp.types import AnyArray
@@ -63,13 +63,13 @@ class NeuromuscularArm(eqx.Module):
     """Damping of a muscle over its stiffness [s]."""
     feedback_gain: Float[Any, ""] = array_field(default=0.3)
     """Of the delayed feedback, as a share of K0. A choice; 0 to 0.6 moves Table 1 by less than a tenth."""
-    feedback_delay: float = eqx.field(static=True, default=0.115)
+    feedback_delay: float = eqx.field(static=True, default=VOLUNTARY_DELAY)
     """[s]; the paper's variation, equal to the voluntary delay."""
     noise_floor: Float[Any, ""] = array_field(default=4.4)
     """Activation noise of a muscle that is not active [N], times `neural_noise`. Calibrated."""
     noise_per_force: Float[Any, ""] = array_field(default=0.05)
     """What an activation of 1 N adds to it. Calibrated."""
-    handle: Handle = Handle()
+    handle: Handle = Handle((5.0, 5.0), (20.0, 20.0))
 
     @property
     def geometry(self) -> ArmGeometry:

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 from numpy.typing import NDArray
 
-from jaximp.isolation import VOLUNTARY_DELAY, Deviations, in_window
+from jaximp.isolation import in_window
 from jaximp.models import ArmLinks, borner_from_lakatos, rigid_body_torque
-from jaximp.movements import Movements
+from jaximp.movements import VOLUNTARY_DELAY, Deviations, Movements
 from jaximp.simulation.neuromuscular import (
     ANGLES,
     POSTURES,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp.models import ArmGeometry
-from jaximp.movements import Movements
+from jaximp.movements import VOLUNTARY_DELAY, Movements
 from jaximp.recordings import recording_from_arrays, save_trial_table
 from jaximp.simulation.neuromuscular import (
     ANGLES,
@@ -34,8 +34,6 @@ from jaximp.types import Numbers, Progress, Recording
 
 EVERY = 2
 """Samples of the simulation for each that is recorded."""
-WINDOW = 0.115
-"""After the onset, over which the true impedance is averaged [s]."""
 SETTLE = 1.0
 """The noise of the static task starts at zero; from here on it is recorded [s]."""
 STATIC = (0.5, 1.1)
@@ -171,7 +169,7 @@ def write_arm_recordings(
     progress(0.9)
     numbers = {"lengths": arm.lengths, "mass": arm.handle.mass, "damping": arm.handle.damping}
     lists = {name: np.asarray(x).tolist() for name, x in numbers.items()}
-    text = JOB.format(format=format, window=WINDOW, **lists)
+    text = JOB.format(format=format, window=VOLUNTARY_DELAY, **lists)
     (folder / "job.toml").write_text(text, encoding="utf-8")
     truth = json.dumps(true_values(arm, moved, seed), indent=1) + "\n"
     (folder / "truth.json").write_text(truth, encoding="utf-8")
@@ -181,7 +179,7 @@ def true_values(arm: NeuromuscularArm, moved: Reaches, seed: int = 0) -> dict[st
     """Impedance of the joints in the window after the onset, mean and standard deviation over perturbed movements; the
     inertia as in Börner et al. 2020, eq. (12); and at the hand, the stiffness at the mean position of the onset."""
     pushed = np.flatnonzero(np.abs(np.asarray(moved.movements.command)).max(axis=(1, 2)) > 0)
-    onset, samples = np.asarray(moved.movements.onset)[pushed], round(WINDOW * RATE)
+    onset, samples = np.asarray(moved.movements.onset)[pushed], round(VOLUNTARY_DELAY * RATE)
     rows = onset[:, None] + np.arange(samples)
     stiffness = np.asarray(moved.stiffness)[pushed[:, None], rows].mean(axis=1)
     mean, sd = (_symmetric(x) for x in (stiffness.mean(axis=0), stiffness.std(axis=0, ddof=1)))
@@ -191,7 +189,7 @@ def true_values(arm: NeuromuscularArm, moved: Reaches, seed: int = 0) -> dict[st
     time = float(arm.damping_time)
     return {
         "seed": seed,
-        "window_s": WINDOW,
+        "window_s": VOLUNTARY_DELAY,
         "stiffness_Nm_per_rad": mean.tolist(),
         "stiffness_sd_over_trials": sd.tolist(),
         "damping_Nms_per_rad": (time * mean).tolist(),

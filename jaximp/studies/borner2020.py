@@ -19,7 +19,6 @@ import numpy as np
 from jaximp import plots
 from jaximp.isolation import (
     METHODS,
-    VOLUNTARY_DELAY,
     Isolated,
     KnownArm,
     Method,
@@ -30,6 +29,7 @@ from jaximp.isolation import (
     static_inertia,
 )
 from jaximp.models import EndpointImpedance, endpoint_impedance, lakatos_from_borner
+from jaximp.movements import VOLUNTARY_DELAY
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach
 from jaximp.stiffness import fit_triangles, fit_triangles_linear, residual_triangle
 from jaximp.studies.arm_experiments import (
