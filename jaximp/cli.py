@@ -276,12 +276,16 @@ def _say_impedance(found: ArmImpedance) -> None:
 
 def _check_trials(job: Job) -> None:
     """How many trials were read, and what reading says of them."""
+    from jaximp.impedance import DISAGREEMENT
+    from jaximp.movement_trials import handle_disagreement
+
     for table in job.tables_of_trials():
         perturbed, unperturbed, notes = table.load()
         kind = "perturbed postures" if table.task == "posture" else "perturbed movements"
         others = 0 if unperturbed is None else len(unperturbed)
         typer.echo(f"{len(perturbed)} {kind}" + (f", {others} unperturbed ones" if table.task != "posture" else ""))
-        for note in notes:
+        share, disagreement = handle_disagreement(perturbed, table.known_handle())
+        for note in (*notes, *([disagreement] if share > DISAGREEMENT[0] else [])):
             typer.echo(f"- {note}")
 
 

@@ -786,8 +786,7 @@ class _Known:
     def __init__(self, job: Job):
         assert job.trials is not None
         assert job.model.hand_arm is not None
-        self._settings, handle = job.model.hand_arm, job.trials.handle
-        self._handle = None if handle is None else handle.make()
+        self._settings, self._handle = job.model.hand_arm, job.trials.known_handle()
         self._table = job.trials.posture
         self._found: dict[bool, StaticFit] = {}
         self.notes: tuple[str, ...] = ()

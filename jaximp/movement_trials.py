@@ -620,7 +620,7 @@ def handle_disagreement(perturbed: Movements, handle: Handle | None) -> tuple[fl
     columns = [np.stack([a[:, k], v[:, k], np.ones(len(a))], axis=1) for k in (0, 1)]
     seen = [np.linalg.lstsq(W, (command - force)[:, k])[0] for k, W in enumerate(columns)]
     left = np.stack([(command - force)[:, k] - W @ seen[k] for k, W in enumerate(columns)], axis=1)
-    mass, damping, offset = (", ".join(f"{x:.3g}" for x in values) for values in zip(*seen, strict=True))
+    mass, damping, offset = (", ".join(f"{x:.2f}" for x in values) for values in zip(*seen, strict=True))
     explained = _rms(left) < off * _rms(force) / 3
     return off, f"the recorded force differs by {100 * off:.3g} % from what command and handle make: " + (
         f"by the recordings, the handle has a mass of {mass} kg and a damping of {damping} N s/m (and the force "

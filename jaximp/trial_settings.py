@@ -131,6 +131,9 @@ class TrialsSettings:
         """All of them, the main one first."""
         return (self.method,) if isinstance(self.method, str) else tuple(self.method)
 
+    def known_handle(self) -> Handle | None:
+        return None if self.handle is None else self.handle.make()
+
     def paths(self) -> list[Path]:
         """Every file, in order; patterns and folders bring theirs in the order of the numbers in their names.
 
@@ -160,9 +163,8 @@ class TrialsSettings:
             postures, notes = read_postures(recordings, onset=self.onset, geometry=geometry, smooth=smooth)
             return postures, None, notes
         trigger = None if self.trigger is None else (self.trigger.axis - 1, self.trigger.position)
-        handle = None if self.handle is None else self.handle.make()
         return read_movements(
-            recordings, window=self.window, onset=self.onset, trigger=trigger, handle=handle,
+            recordings, window=self.window, onset=self.onset, trigger=trigger, handle=self.known_handle(),
             geometry=geometry, smooth=smooth,
         )  # fmt: skip
 

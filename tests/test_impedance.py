@@ -227,8 +227,8 @@ def lagging(milliseconds: float) -> Callable[[Movements], Movements]:
 
 
 SPOILT: dict[str, tuple[Callable[[Movements], Movements], Handle, str]] = {
-    "another damping": (lambda m: m, Handle((5.0, 5.0), (10.0, 10.0)), "a mass of 5, 5 kg and a damping of 20, 20"),
-    "another mass": (lambda m: m, Handle((5.0, 6.0), (20.0, 20.0)), "the handle has a mass of 5, 5 kg"),
+    "another damping": (lambda m: m, Handle((5.0, 5.0), (10.0, 10.0)), "a mass of 5.00, 5.00 kg and a damping of 20.0"),
+    "another mass": (lambda m: m, Handle((5.0, 6.0), (20.0, 20.0)), "the handle has a mass of 5.00, 5.00 kg"),
     "force of the other sign": (
         lambda m: eqx.tree_at(lambda m: m.force, m, -m.force), Handle((5.0, 5.0), (20.0, 20.0)), "check the sign",
     ),
@@ -260,7 +260,7 @@ def test_a_handle_that_is_a_little_wrong_is_a_warning(enough: Path) -> None:
     known = KnownArm(GEOMETRY, ARM.inertia, Handle((5.0, 5.0), (19.2, 19.2)))
     found = identify_impedance(perturbed, unperturbed, known, "gomi_kawato")
     assert found.trusted
-    assert any("a damping of 20, 20 N s/m" in warning for warning in found.warnings)
+    assert any("a damping of 20.0" in warning for warning in found.warnings)
 
 
 def test_an_offset_of_the_force_sensor_is_no_disagreement(enough: Path) -> None:
