@@ -173,14 +173,14 @@ class Panel:
 
 @styled
 def curves(panels: Sequence[Panel], columns: int = 1) -> Figure:
-    """Panels row by row, each with its legend beside it; in several columns one legend, beside the last of them."""
+    """Panels row by row, with a legend of several lines beside each; of several columns, beside the last."""
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(WIDTH, 2.2 * rows + 0.3))
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(panels) :]:
         axis.remove()
     for k, (axis, panel) in enumerate(zip(axes[: len(panels)], panels, strict=True)):
-        beside = (k + 1) % columns == 0
+        beside = (k + 1) % columns == 0 and len(panel.lines) > 1
         for i, (label, x, y) in enumerate(panel.lines):
             color, style = (BLACK, "-") if i == 0 else LINES[:4][(i - 1) % 4]
             draw_line(axis, x, y, label=label, color=color, linestyle=style, linewidth=0.9 if i else 1.3)
