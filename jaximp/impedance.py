@@ -65,10 +65,8 @@ BIASES = {
     "feedback_jerk": "feedback jerk isolation: its stiffness came out 8 to 23 % too large on simulated recordings (the "
     "filter of the derivatives blurs the onset, from which the jerk is integrated), and 5 to 10 % too small on "
     "simulated motion that is known exactly; the standard errors know of neither (README)",
-    "erden_billard": "the state at the onset passes for the unperturbed movement, which suits postures: on simulated "
-    "movements the damping came out 21 % wrong, far beyond its standard errors (README)",
 }
-"""What users of a method must know, from 20 recordings of `simulate arm`, and for the first from simulated subjects."""
+"""What users of a method must know, from 20 recordings of `simulate arm` and from simulated subjects."""
 ENOUGH = 30
 """Unperturbed movements from which output error learns well how they go on."""
 BENT = 0.4
