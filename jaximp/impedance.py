@@ -603,7 +603,7 @@ def _limits_of_own(result: ArmImpedance, own: Impedance) -> list[str]:
     if result.unperturbed < ENOUGH:
         warnings.append(
             f"{result.unperturbed} unperturbed movements teach little of how a movement goes on: with 10, intervals of "
-            "95 % held K11 in 75 to 88 % of simulated groups; record 30 or more"
+            "95 % held K11 in 79 to 92 % of simulated groups; record 30 or more"
         )
     if bent > BENT:
         warnings.append(

@@ -47,8 +47,8 @@ inertia: their errors are not independent.
 **Limits.** All numbers of this project for it are from a simulation whose arm is the fitted model: rigid, linear in the
 window, noise that ends steeply at 2 Hz, no soft tissue, no drift, no fatigue, and the commanded force is really
 applied; it is integrated by the method and the step of the fit. There 95 % intervals hold K in 93 to 99 % of groups of
-20 trials in movements of 2 and 3 s, but K11 in 84 % at 1 s, where the stiffness bends within the window, and in 75 to
-90 % with 10 unperturbed trials or a noisy position. `chi2` tells timing, calibration or noise level that are grossly
+20 trials in movements of 2 and 3 s, but K11 in 84 % at 1 s, where the stiffness bends within the window, and in 79 to
+92 % with 10 unperturbed trials or a noisy position. `chi2` tells timing, calibration or noise level that are grossly
 wrong; that it is low proves nothing: a command 1 % too large biases D by 3 % and is not noticed.
 """
 
