@@ -80,7 +80,9 @@ def test_small_opposite_pushes_move_the_arm_oppositely(quiet: Reaches) -> None:
 
 def test_work_of_a_push_becomes_kinetic_energy() -> None:
     """Muscles without springs, handle without damping: the energy of arm and handle is what the command has done."""
-    limp = NeuromuscularArm(intrinsic_stiffness=np.zeros(6), stiffness_per_force=0.0, handle=Handle(damping=(0.0, 0.0)))
+    limp = NeuromuscularArm(
+        intrinsic_stiffness=np.zeros(6), stiffness_per_force=0.0, handle=Handle((5.0, 5.0), (0.0, 0.0))
+    )
     still = Reach(goal=(0.0, 0.3001), trigger=0.30)
     moved = simulate(limp, still, PUSHES[1:], QUIET[1:, :2000]).movements
     q, dq, _ = limp.geometry.joint_motion(moved.position, moved.velocity, moved.acceleration)
