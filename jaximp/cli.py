@@ -66,6 +66,7 @@ class Paper(StrEnum):
 
     tout2023 = "tout2023"
     lakatos2011 = "lakatos2011"
+    borner2020 = "borner2020"
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ import pytest
 from scipy.io import savemat
 from test_identify import TIME, joint
 
-from jaximp import cli
+from jaximp import cli, studies
 from jaximp.recordings import save_recording
 
 JOB = """
@@ -111,6 +111,13 @@ def test_usage_errors_have_status_2(run) -> None:  # type: ignore[no-untyped-def
     assert run("identify")[0] == 2
     assert run("reproduce", "nobody1900", "--out", "x")[0] == 2
     assert run("simulate", "rig", "--colour", "red")[0] == 2
+
+
+def test_every_paper_can_be_reproduced() -> None:
+    """That of every study which has a function for it."""
+    folder = Path(studies.__file__).parent
+    there = {file.stem for file in folder.glob("*.py") if "\ndef reproduce(" in file.read_text(encoding="utf-8")}
+    assert there == {paper.value for paper in cli.Paper} == {"tout2023", "lakatos2011", "borner2020"}
 
 
 @pytest.mark.parametrize("command", ["demo", "check", "identify", "simulate", "reproduce"])
