@@ -23,6 +23,7 @@ from jaximp.models.endpoint import (
 )
 from jaximp.models.joint import HumanJoint, RobotJoint, parameter_units
 from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.models.reflex import ReflexGain, ReflexPathway, pathway_of, reflex_gain
 
 __all__ = [
     "MOTION",
@@ -35,6 +36,8 @@ __all__ = [
     "Joints",
     "Model",
     "PlanarArm",
+    "ReflexGain",
+    "ReflexPathway",
     "RobotJoint",
     "Stacked",
     "borner_from_lakatos",
@@ -49,7 +52,9 @@ __all__ = [
     "lakatos_from_borner",
     "mass_matrix",
     "parameter_units",
+    "pathway_of",
     "propagated_stderr",
+    "reflex_gain",
     "rigid_body_torque",
     "solve_pair",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,8 @@ MOTION = ("q", "dq", "ddq", "1")
 class Model(eqx.Module):
     """A model that is linear in its parameters.
 
-    A subclass sets the attributes below and writes `row` for **one** sample; batches and whole recordings follow.
+    A subclass sets the attributes below and writes `row` for **one** sample; batches and whole recordings follow. A
+    model with memory writes `observation_matrix` in its place, and says how long the memory is.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -28,6 +31,20 @@ class Model(eqx.Module):
     """What goes in front of the names when models are stacked, such as `robot`."""
     n_joints: int = eqx.field(static=True)
     """How many joints the regressor has rows for."""
+
+    @property
+    def memory(self) -> int:
+        """How many samples of the past a row needs; of a recording, so many rows at the beginning are not known."""
+        return 0
+
+    @property
+    def sample_rate(self) -> float | None:
+        """Of the recordings that a model with memory is made for [Hz]; None without memory."""
+        return None
+
+    def sampled_at(self, sample_rate: float) -> Model:
+        """The model for recordings of another sample rate [Hz]."""
+        return self
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Regressor of one sample: `(p,)` for one joint, `(n, p)` for several."""
@@ -43,7 +60,13 @@ class Model(eqx.Module):
 
         **Returns:** `(..., p)` for one joint, `(..., n, p)` for n joints; the units of the columns are those that
         make `units` come out.
+
+        **Raises:** `ValueError` for shapes that differ, and for a model with memory, which needs a whole recording.
         """
+        if self.memory:
+            raise ValueError(
+                "a model with a reflex needs the past of every sample: pass a whole recording to observation_matrix"
+            )
         q, dq, ddq = jnp.asarray(q), jnp.asarray(dq), jnp.asarray(ddq)
         if not q.shape == dq.shape == ddq.shape:
             raise ValueError(
@@ -61,8 +84,23 @@ class Model(eqx.Module):
     def observation_matrix(
         self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
     ) -> Float[Array, "N *n p"]:
-        """Regressor of every sample of a recording; models with memory override it."""
+        """Regressor of every sample of a recording; models with memory override it.
+
+        **Returns:** `(N, p)` or `(N, n, p)`; NaN where the past that a column needs is before the first sample.
+        """
         return self.regressor(q, dq, ddq)
+
+    def over_period(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"], sample_rate: float
+    ) -> Float[Array, "N *n p"]:
+        """`observation_matrix` of one period of a periodic motion: what was before is the end of the period.
+
+        **Arguments:** `sample_rate` [Hz] of the period's samples, which need not be that of the recordings.
+        """
+        model, n = self.sampled_at(sample_rate), len(jnp.asarray(q))
+        periods = 1 + -(-model.memory // n)
+        motion = (jnp.concatenate([jnp.asarray(x)] * periods) for x in (q, dq, ddq))
+        return model.observation_matrix(*motion)[-n:]
 
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         """The model with signs of the velocity that change gradually, within some `width` [rad/s or m/s] of zero."""
@@ -75,7 +113,12 @@ class Model(eqx.Module):
         dq: Num[ArrayLike, "..."],
         ddq: Num[ArrayLike, "..."],
     ) -> Float[Array, "..."]:
-        """Torque [N m] (force [N] for prismatic joints) that the parameters `theta` give."""
+        """Torque [N m] (force [N] for prismatic joints) that the parameters `theta` give.
+
+        A model with memory takes a whole recording, and returns NaN where its past is not known.
+        """
+        if self.memory:
+            return self.observation_matrix(q, dq, ddq) @ theta
         return self.regressor(q, dq, ddq) @ theta
 
     def __add__(self, other: Model) -> Model:
@@ -104,11 +147,28 @@ class Stacked(Model):
         self.label = ""
         self.n_joints = first.n_joints
 
+    @property
+    def memory(self) -> int:
+        return max(self.first.memory, self.second.memory)
+
+    @property
+    def sample_rate(self) -> float | None:
+        return _shared_rate(self.first, self.second)
+
+    def sampled_at(self, sample_rate: float) -> Model:
+        return _pair(self, lambda model: model.sampled_at(sample_rate))
+
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
-        return _pair_smoothed(self, width)
+        return _pair(self, lambda model: model.smoothed(width))
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         return jnp.concatenate([self.first.row(q, dq, ddq), self.second.row(q, dq, ddq)], axis=-1)
+
+    def observation_matrix(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
+    ) -> Float[Array, "N *n p"]:
+        both = [model.observation_matrix(q, dq, ddq) for model in (self.first, self.second)]
+        return jnp.concatenate(both, axis=-1)
 
 
 class Combined(Model):
@@ -134,13 +194,31 @@ class Combined(Model):
         self.label = ""
         self.n_joints = first.n_joints
 
+    @property
+    def memory(self) -> int:
+        return max(self.first.memory, self.second.memory)
+
+    @property
+    def sample_rate(self) -> float | None:
+        return _shared_rate(self.first, self.second)
+
+    def sampled_at(self, sample_rate: float) -> Model:
+        return _pair(self, lambda model: model.sampled_at(sample_rate))
+
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
-        return _pair_smoothed(self, width)
+        return _pair(self, lambda model: model.smoothed(width))
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
-        both = Stacked(self.first, self.second)
-        keep = jnp.array([both.columns.index(column) for column in self.columns])
-        return both.row(q, dq, ddq)[..., keep]
+        return self._kept(Stacked(self.first, self.second).row(q, dq, ddq))
+
+    def observation_matrix(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
+    ) -> Float[Array, "N *n p"]:
+        return self._kept(Stacked(self.first, self.second).observation_matrix(q, dq, ddq))
+
+    def _kept(self, W: Array) -> Array:
+        stacked = self.first.columns + self.second.columns
+        return W[..., jnp.array([stacked.index(column) for column in self.columns])]
 
 
 class Joints(Model):
@@ -158,6 +236,19 @@ class Joints(Model):
         self.columns = tuple(tag + column for tag, model in tagged for column in model.columns)
         self.label = models[0].label
         self.n_joints = len(models)
+        _shared_rate(*models)
+
+    @property
+    def memory(self) -> int:
+        return max(model.memory for model in self.models)
+
+    @property
+    def sample_rate(self) -> float | None:
+        return _shared_rate(*self.models)
+
+    def sampled_at(self, sample_rate: float) -> Model:
+        models = tuple(model.sampled_at(sample_rate) for model in self.models)
+        return eqx.tree_at(lambda joints: joints.models, self, models)
 
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         widths = jnp.atleast_1d(jnp.asarray(width))
@@ -170,17 +261,42 @@ class Joints(Model):
         rows = [model.row(q[i], dq[i], ddq[i]) for i, model in enumerate(self.models)]
         return jax.scipy.linalg.block_diag(*[row[None, :] for row in rows])
 
+    def observation_matrix(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
+    ) -> Float[Array, "N *n p"]:
+        if not self.memory:
+            return self.regressor(q, dq, ddq)
+        if self.n_joints == 1:
+            return self.models[0].observation_matrix(q, dq, ddq)
+        motion = [jnp.asarray(x) for x in (q, dq, ddq)]
+        blocks = [model.observation_matrix(*(x[:, i] for x in motion)) for i, model in enumerate(self.models)]
+        W = jnp.zeros((len(motion[0]), self.n_joints, len(self.names)), blocks[0].dtype)
+        first = 0
+        for i, block in enumerate(blocks):
+            W = W.at[:, i, first : first + block.shape[1]].set(block)
+            first += block.shape[1]
+        return W
+
 
 def combine(first: Model, second: Model) -> Combined:
     """Stack two models and merge the columns they share: Tout et al. 2023, eq. (11)."""
     return Combined(first, second)
 
 
-def _pair_smoothed(pair: Model, width: Num[ArrayLike, "*n"]) -> Model:
-    both = pair.first.smoothed(width), pair.second.smoothed(width)  # type: ignore[attr-defined]
+def _pair(pair: Model, change: Callable[[Model], Model]) -> Model:
+    both = change(pair.first), change(pair.second)  # type: ignore[attr-defined]
     return eqx.tree_at(lambda pair: (pair.first, pair.second), pair, both)
+
+
+def _shared_rate(*models: Model) -> float | None:
+    """The sample rate of all models that have memory."""
+    rates = {model.sample_rate for model in models if model.sample_rate is not None}
+    if len(rates) > 1:
+        raise ValueError(f"models for sample rates of {sorted(rates)} Hz cannot be stacked: give both the recording's")
+    return next(iter(rates), None)
 
 
 def _check_joints(first: Model, second: Model) -> None:
     if first.n_joints != second.n_joints:
         raise ValueError(f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked")
+    _shared_rate(first, second)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.base import Model
+from jaximp.models.reflex import ReflexPathway
 from jaximp.types import AnyArray
 
 _REVOLUTE = {
@@ -46,13 +47,21 @@ class HumanJoint(Model):
 
     **Arguments:** `offset` adds the last column (eq. 7). `gear_ratio` N1 other than one says that position and torque
     are those of the motor (eqs. 19, 20); `at_joint` then gives the parameters of the joint itself. `joint` is
-    `revolute` or `prismatic`.
+    `revolute` or `prismatic`. With a `reflex` its torque is added, the parameters of it stand last, and the joint has a
+    memory (`models.ReflexPathway`).
     """
 
     gear_ratio: float
     offset: bool = eqx.field(static=True)
+    reflex: ReflexPathway | None
 
-    def __init__(self, offset: bool = True, gear_ratio: float = 1.0, joint: str = "revolute"):
+    def __init__(
+        self,
+        offset: bool = True,
+        gear_ratio: float = 1.0,
+        joint: str = "revolute",
+        reflex: ReflexPathway | None = None,
+    ):
         unit = parameter_units(joint)
         self.gear_ratio = _positive(gear_ratio)
         self.offset = offset
@@ -61,19 +70,49 @@ class HumanJoint(Model):
         self.columns = ("ddq", "dq", "q") + ("1",) * offset
         self.label = "human"
         self.n_joints = 1
+        self.reflex = reflex
+        if reflex is not None:
+            self.names += reflex.names
+            self.units += (unit["damping"],) * len(reflex.names)
+            self.columns += reflex.columns
+
+    @property
+    def memory(self) -> int:
+        return 0 if self.reflex is None else self.reflex.memory
+
+    @property
+    def sample_rate(self) -> float | None:
+        return None if self.reflex is None else self.reflex.sample_rate
+
+    def sampled_at(self, sample_rate: float) -> Model:
+        if self.reflex is None:
+            return self
+        return eqx.tree_at(lambda joint: joint.reflex, self, self.reflex.sampled_at(sample_rate))
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
+        if self.reflex is not None:
+            return self.reflex.row(q, dq, ddq)  # which says why there is none
         return jnp.stack([ddq, dq, q] + [jnp.ones_like(q)] * self.offset)
+
+    def observation_matrix(
+        self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]
+    ) -> Float[Array, "N *n p"]:
+        if self.reflex is None:
+            return self.regressor(q, dq, ddq)
+        intrinsic = HumanJoint(self.offset).regressor(q, dq, ddq)
+        return jnp.concatenate([intrinsic, self.reflex.observation_matrix(q, dq, ddq)], axis=-1)
 
     def at_joint(self, theta: Num[AnyArray, "*M p"]) -> Float[Array, "*M p"]:
         """Parameters on the joint's side of the gear from those on the motor's side.
 
         With `theta_joint = q/N1` and `torque_joint = N1 * torque`, the inertia, damping and stiffness are N1^2 times
-        those at the motor and the offset torque N1 times. (Eqs. 19, 20; the paper divides the whole vector by N1^2,
-        yet defines the offset as stiffness * N1 * equilibrium, which divides it by N1: the latter is right.)
+        those at the motor (as the weights of a reflex are) and the offset torque N1 times. (Eqs. 19, 20; the paper
+        divides the whole vector by N1^2, yet defines the offset as stiffness * N1 * equilibrium, which divides it by
+        N1: the latter is right.)
         """
         n = self.gear_ratio
-        return jnp.asarray(theta) * jnp.array([n**2, n**2, n**2] + [n] * self.offset)
+        lags = 0 if self.reflex is None else len(self.reflex.lags)
+        return jnp.asarray(theta) * jnp.array([n**2] * 3 + [n] * self.offset + [n**2] * lags)
 
     def equilibrium(self, theta: Num[AnyArray, "*M p"]) -> Float[Array, "*M"]:
         """Position [rad or m] at which the elastic torque vanishes, on the side of the gear that `theta` belongs to."""
