@@ -109,7 +109,7 @@ def coherent_bandwidth(recording: Recording) -> float:
 
 def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
     """Delay of the torque behind the position [s] at which the model fits best, and whether the data determine it."""
-    robot, human = job.models(recording.joints)
+    robot, human = job.models(recording.joints, recording.sample_rate)
     model = human if robot is None else robot if human is None else combine(robot, human)
     assert model is not None
     undecimated = replace(job, filter=replace(job.filter, decimate=1, mode="once"))

@@ -10,7 +10,7 @@ from typing import Any
 
 from jaximp.excitation import OBJECTIVES, Design, Encoder, Limits, design_excitation
 from jaximp.job import ModelSettings, model_settings
-from jaximp.models import HumanJoint, Joints, Model, RobotJoint, combine
+from jaximp.models import Joints, Model, RobotJoint, combine
 from jaximp.optimise import METHODS
 from jaximp.settings import check_keys, checked, read, settings
 from jaximp.types import Progress, nearest
@@ -95,7 +95,7 @@ class DesignJob:
         if self.model.arm is not None:
             return self.model.arm.make()
         made: list[Model] = [] if robot is None or "robot" not in whom else [RobotJoint(**vars(robot))]
-        made += [] if human is None or "human" not in whom else [HumanJoint(**vars(human))]
+        made += [] if human is None or "human" not in whom else [human.make(self.design.sample_rate)]
         one = made[0] if len(made) == 1 else combine(*made)
         return one if joints == 1 else Joints(*[one] * joints)
 

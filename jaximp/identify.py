@@ -139,7 +139,7 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
     """Filter the recordings of a job."""
     signals.require_float64(recording.position)
     check_window(job, recording)
-    robot, human = job.models(recording.joints)
+    robot, human = job.models(recording.joints, recording.sample_rate)
     filters = design_filters(job.filter, recording.sample_rate)
     noise = noise_of_rows(job, recording, filters)
     model = robot if human is None else human
@@ -419,10 +419,11 @@ def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | Non
         )
     if isinstance(prepared.reference, str):
         return None, prepared.reference
-    motion = tuple(x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
-    W = prepared.model.observation_matrix(*motion).reshape(-1, len(prepared.model.names))
-    window = round(job.window.length * prepared.recording.sample_rate * place.counted / place.window)
-    return float(fake_change_threshold(W, len(motion[0]), window)), ""
+    q, dq, ddq = (x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
+    rate = prepared.recording.sample_rate
+    W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))
+    window = round(job.window.length * rate * place.counted / place.window)
+    return float(fake_change_threshold(W, len(q), window)), ""
 
 
 def _reference(job: Job, recording: Recording) -> ReferenceMotion:

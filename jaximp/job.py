@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design_files import read_trajectory
-from jaximp.models import HumanJoint, Joints, Model, PlanarArm, RobotJoint
+from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
 from jaximp.payload import METHODS
 from jaximp.recordings import recording_from_mapping
 from jaximp.settings import check_keys, checked, optional, read, settings
@@ -75,11 +75,47 @@ class RobotSettings:
 
 
 @dataclass(frozen=True)
+class ReflexSettings:
+    """Lags of `models.ReflexPathway`, evenly spread; `reflex = true` takes these."""
+
+    first: float = 0.04
+    """Shortest lag [s]: the delay of the reflex, at the most."""
+    last: float = 0.49
+    """Longest lag [s], by which the reflex should have ended."""
+    count: int = 31
+    """How many; closer than half a period of `filter.decimation_cutoff` they cannot be told apart."""
+    direction: int = 1
+    """1 where a velocity above zero stretches the muscle, else -1."""
+
+    def lags(self) -> list[float]:
+        """[s]."""
+        if self.count < 1:
+            raise ValueError(f"count is {self.count}: give at least one lag")
+        step = (self.last - self.first) / max(1, self.count - 1)
+        return [round(self.first + k * step, 9) for k in range(self.count)]
+
+
+@dataclass(frozen=True)
 class HumanSettings:
     """Columns of `models.HumanJoint`."""
 
     offset: bool = True
     gear_ratio: float = 1.0
+    reflex: bool | ReflexSettings = False
+    """`true`, or a table with some of the settings: the stretch reflex."""
+
+    def make(self, sample_rate: float | None = None, joint: str = "revolute") -> HumanJoint:
+        """The model, for recordings of a sample rate [Hz], which only a reflex needs."""
+        reflex = ReflexSettings() if self.reflex is True else self.reflex
+        if not reflex:
+            return HumanJoint(self.offset, self.gear_ratio, joint)
+        if sample_rate is None:
+            raise ValueError("a reflex needs the sample rate of the recording: pass models(joints, sample_rate)")
+        try:
+            pathway = ReflexPathway(sample_rate, reflex.lags(), reflex.direction)
+        except ValueError as error:
+            raise ValueError(f"model.human.reflex: {error}") from None
+        return HumanJoint(self.offset, self.gear_ratio, joint, pathway)
 
 
 @dataclass(frozen=True)
@@ -172,9 +208,9 @@ class Job:
         tables = (self.trials, self.trials and self.trials.posture)
         return [table for table in tables if table is not None]
 
-    def models(self, joints: tuple[str, ...]) -> tuple[Model | None, Model | None]:
+    def models(self, joints: tuple[str, ...], sample_rate: float | None = None) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
-        one model of two joints, stands in the robot's place."""
+        one model of two joints, stands in the robot's place. A human with a reflex needs the `sample_rate` [Hz]."""
         robot, human = self.model.robot, self.model.human
         if self.model.arm is not None:
             if joints != ("revolute", "revolute"):
@@ -184,7 +220,7 @@ class Job:
                 )
             return self.model.arm.make(), None
         robots = None if robot is None else [RobotJoint(**vars(robot), joint=joint) for joint in joints]
-        humans = None if human is None else [HumanJoint(**vars(human), joint=joint) for joint in joints]
+        humans = None if human is None else [human.make(sample_rate, joint) for joint in joints]
         one_or_joints = [
             None if models is None else models[0] if len(models) == 1 else Joints(*models)
             for models in (robots, humans)
@@ -278,6 +314,10 @@ def _check_values(job: Job) -> None:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
     if not both and job.robot_recording is not None:
         raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
+    if job.model.human is not None:
+        job.model.human.make(1000.0)  # refuses lags that make no sense
+        if job.model.human.reflex and job.filter.mode == "window":
+            raise ValueError("filter.mode = 'window' cuts off the past that a reflex answers to: set it to 'once'")
     if job.filter.mode not in ("once", "window"):
         raise ValueError(f"filter.mode is '{job.filter.mode}': it must be 'once' or 'window'")
     positive = {

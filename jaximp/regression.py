@@ -101,20 +101,38 @@ def _plain(sos: NDArray[np.float64] | None) -> signals.Sections | None:
 
 def regress(model: Model, recording: Recording, job: Job, filters: Filters) -> Rows:
     """Filter a recording and evaluate the model on it, once or inside every window, as the job says."""
+    _check_memory(model, recording, job)
     q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
     derivatives = _measured_derivatives(job.filter, recording)
     if job.filter.mode == "window":
         return _regress_in_windows(model, recording, job, filters, q, torque)
     W, y, speed = filtered(model, filters, recording.sample_rate, q, torque, derivatives)
-    valid = undisturbed(recording, filters)[:: filters.decimate]
+    valid = undisturbed(recording, filters, memory=model.memory)[:: filters.decimate]
     moving = np.asarray(speed) >= job.window.min_velocity
     valid = valid & moving if recording.n_joints == 1 else valid[:, None] & moving
     if not valid.any():
         raise ValueError(
             f"no sample is left after filtering ({np.mean(~recording.valid):.0%} were not measured): the recording is "
-            "too short for the filters, has too many gaps, or never moves faster than window.min_velocity"
+            "too short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
+            "window.min_velocity"
         )
     return Rows(W, y, valid, recording.time[:: filters.decimate])
+
+
+def _check_memory(model: Model, recording: Recording, job: Job) -> None:
+    """A model with memory must see the past, and know how many samples it is."""
+    if model.sample_rate is None:
+        return
+    if job.filter.mode == "window":
+        raise ValueError(
+            "filter.mode = 'window' cuts off the past that a reflex answers to: set filter.mode = 'once', or leave the "
+            "reflex out"
+        )
+    if abs(model.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+        raise ValueError(
+            f"the reflex was made for {model.sample_rate:g} Hz, but the recording has {recording.sample_rate:g} Hz: "
+            "give the model the recording's sample rate"
+        )
 
 
 def jumped(recording: Recording) -> NDArray[np.bool_]:
@@ -122,15 +140,19 @@ def jumped(recording: Recording) -> NDArray[np.bool_]:
     return np.any([signals.jumps(q) for q in recording.position.T], axis=0)
 
 
-def undisturbed(recording: Recording, filters: Filters, ends: bool = True) -> NDArray[np.bool_]:
+def undisturbed(recording: Recording, filters: Filters, ends: bool = True, memory: int = 0) -> NDArray[np.bool_]:
     """(N,) samples whose filtered value comes from measurements, and not from a gap, a jump or (`ends`) an end.
 
-    A gap that is short against the filters is bridged: the straight line across it is as good as a measurement.
+    A gap that is short against the filters is bridged: the straight line across it is as good as a measurement. What a
+    gap, a jump or the beginning spoils, a model with a `memory` of so many samples remembers.
     """
-    missing = signals.long_gaps(recording.valid, filters.bridge)
-    valid = signals.widen_gaps(~missing, filters.reach, ends)
+    known = ~signals.long_gaps(recording.valid, filters.bridge)
+    known[: memory if ends else 0] = False
+    valid = signals.widen_gaps(signals.lengthen_gaps(known, memory), filters.reach, ends)
     jumps = jumped(recording)
-    return valid & signals.widen_gaps(~jumps, filters.ringing, ends=False) if jumps.any() else valid
+    if not jumps.any():
+        return valid
+    return valid & signals.widen_gaps(signals.lengthen_gaps(~jumps, memory), filters.ringing, ends=False)
 
 
 @eqx.filter_jit
@@ -157,6 +179,8 @@ def filtered(
     one_joint = q.shape[1] == 1
     motion = tuple(x[:, 0] if one_joint else x for x in (q, dq, ddq))
     W = model.observation_matrix(*motion)
+    if model.memory:  # the filters need numbers; `undisturbed` lets none of these count
+        W = W.at[: model.memory].set(jnp.nan_to_num(W[: model.memory]))
     y = jnp.asarray(torque)[:, 0] if one_joint else jnp.asarray(torque)
     if filters.parallel is not None:
         both = jnp.concatenate([W, y[..., None]], axis=-1)

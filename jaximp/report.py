@@ -73,7 +73,7 @@ def write_results(
     lengths, or nothing.
     """
     folder = Path(folder)
-    human = job.models(recording.joints)[1]
+    human = job.models(recording.joints, recording.sample_rate)[1]
     for k, estimates in enumerate(estimates_list):
         name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
         pq.write_table(estimates_table(estimates, human, job), folder / f"{name}.parquet")
@@ -139,7 +139,7 @@ def summary(
     The main method's results stand at the top level, those of further methods under `further_methods` and those of
     several window lengths under `window_lengths`, in the same form.
     """
-    robot, human = job.models(recording.joints)
+    robot, human = job.models(recording.joints, recording.sample_rate)
     main = estimates_list[0]
     content = {
         **_result(main, human),

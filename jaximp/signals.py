@@ -398,6 +398,12 @@ def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[
     return np.asarray(near == 0)[1:-1]
 
 
+def lengthen_gaps(valid: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """Also invalidate `by` samples after every gap: where a memory reaches back into it."""
+    gone = np.cumsum(np.r_[np.zeros(by + 1), ~valid])
+    return np.asarray(gone[by + 1 :] == gone[: len(valid)])
+
+
 def jumps(x: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Where a signal (N,) leaps between two samples as no joint can move; both samples are True.
 

@@ -161,7 +161,7 @@ def _human_rows(recordings: tuple[Recording, Recording], offset: bool) -> tuple[
     alone, held = recordings
     job = _job(offset, 2.0, mode="once")
     job = replace(job, filter=replace(job.filter, decimate=1))
-    robot, human = job.models(held.joints)
+    robot, human = job.models(held.joints, held.sample_rate)
     assert robot is not None
     assert human is not None
     filters = design_filters(job.filter, held.sample_rate)
