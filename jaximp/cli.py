@@ -297,9 +297,8 @@ def _say_result(estimates: Estimates) -> None:
         typer.echo("no window can be trusted, for example: " + next(filter(None, estimates.verdicts.reason)))
         return
     typer.echo("mean and standard deviation over the trusted windows:")
-    found = zip(
-        estimates.names, estimates.units, estimates.mean_over_trusted(), estimates.sd_over_trusted(), strict=True
-    )
+    shown = estimates.summarised()
+    found = zip(shown.names, shown.units, shown.mean_over_trusted(), shown.sd_over_trusted(), strict=True)
     for name, unit, mean, sd in found:
         typer.echo(f"{name:>20} {mean:11.4g} ({sd:.2g}) {unit}")
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.job import Job
 from jaximp.least_squares import SlidingFit, WindowFit
-from jaximp.models import Joints, Model, combine
-from jaximp.payload import METHODS, Regression, fit_robot, separate
+from jaximp.models import Joints, Model, combine, pathway_of, with_gain
+from jaximp.payload import METHODS, Regression, Separation, fit_robot, separate
 from jaximp.regression import (
     Filters,
     Placement,
@@ -37,11 +38,33 @@ from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest
 from jaximp.windows import score, sliding_least_squares
 
+CLEAR = 2.0
+"""A reflex whose gain is so many standard errors from zero has a delay."""
 STILL = 1e-3
 """A window whose torque varies by a smaller share of the recording's variance can neither confirm nor refute."""
 
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
+
+
+@dataclass(frozen=True)
+class Reflex:
+    """The reflex of one joint in all windows."""
+
+    name: str
+    """`reflex`; with several joints `joint1.reflex`."""
+    unit: str
+    """Of the gain and of the weights."""
+    lags: NDArray[np.float64]
+    """(k,) [s]."""
+    columns: NDArray[np.int64]
+    """(k,) where their weights stand among the parameters."""
+    gain: NDArray[np.float64]
+    """(M,) sum of the weights; above zero where the reflex resists the stretch."""
+    gain_stderr: NDArray[np.float64]
+    """(M,)."""
+    delay: NDArray[np.float64]
+    """(M,) mean lag by weight [s]; NaN where the gain is within two standard errors of zero."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +102,33 @@ class Estimates:
     robot_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     """What a reader must know of these numbers, in plain words."""
+    reflexes: tuple[Reflex, ...] = ()
+    """Of every joint that has one."""
+
+    @property
+    def intrinsic(self) -> NDArray[np.int64]:
+        """Which parameters are no weights of a reflex."""
+        weights = [reflex.columns for reflex in self.reflexes]
+        return np.setdiff1d(np.arange(len(self.names)), np.concatenate([[], *weights]))
+
+    def summarised(self) -> Estimates:
+        """With the gain of every reflex in place of its weights: what a person wants to see of all parameters."""
+        if not self.reflexes:
+            return self
+        kept, gone = self.intrinsic, np.full((len(self.end), len(self.reflexes)), np.nan)
+        found = (
+            (self.fit.theta, np.stack([reflex.gain for reflex in self.reflexes], axis=1)),
+            (self.fit.stderr, np.stack([reflex.gain_stderr for reflex in self.reflexes], axis=1)),
+            (self.fit.excitation, gone),
+        )
+        columns = tuple(np.concatenate([np.asarray(x)[:, kept], gain], axis=1) for x, gain in found)
+        return replace(
+            self,
+            names=(*(self.names[k] for k in kept), *(f"{reflex.name}_gain" for reflex in self.reflexes)),
+            units=(*(self.units[k] for k in kept), *(reflex.unit for reflex in self.reflexes)),
+            fit=eqx.tree_at(lambda f: (f.theta, f.stderr, f.excitation), self.fit, columns),
+            reflexes=(),
+        )
 
     def mean_over_trusted(self) -> NDArray[np.float64]:
         """(p,) mean of each parameter over the trusted windows; NaN if there are none."""
@@ -179,20 +229,32 @@ def in_windows(
     place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
     if prepared.pair is None:
         valid = jnp.asarray(rows.valid)
-        fit = sliding_least_squares(
-            rows.W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=place.room
-        )
-        return [_estimates(job, prepared, rows, fit, place)]
+
+        def solve(W: Array) -> SlidingFit:
+            return sliding_least_squares(
+                W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=place.room
+            )
+
+        fit = solve(rows.W)
+        gain = solve(with_gain(prepared.model, rows.W)) if prepared.model.memory else None
+        return [_estimates(job, prepared, rows, fit, place, gain=gain)]
     pair = prepared.pair
     merge = combine(pair.robot, prepared.model).merge
     results = []
     for count, method in enumerate(job.model.methods):
-        found = separate(
-            method, pair.robot_fit, pair.alone, pair.loaded, merge, place.window, place.step, noise, place.room
-        )
+
+        def solve_pair(alone: Regression, loaded: Regression, method: int = method) -> Separation:
+            return separate(method, pair.robot_fit, alone, loaded, merge, place.window, place.step, noise, place.room)
+
+        found, gain = solve_pair(pair.alone, pair.loaded), None
+        if prepared.model.memory:
+            alone, loaded = (replace(x, human=with_gain(prepared.model, x.human)) for x in (pair.alone, pair.loaded))
+            gain = solve_pair(alone, loaded).fit
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
-        estimates = _estimates(job, prepared, human, found.fit, place, method, METHODS[method], found.warning)
+        estimates = _estimates(
+            job, prepared, human, found.fit, place, method, METHODS[method], found.warning, gain=gain
+        )
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(job.model.methods))
     return results
@@ -278,7 +340,16 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         reconstructed=np.concatenate([part.reconstructed for part in parts], axis=1),
         predicted=np.concatenate([part.predicted for part in parts], axis=1),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        reflexes=tuple(_reflexes_side_by_side(parts)),
     )
+
+
+def _reflexes_side_by_side(parts: list[Estimates]) -> Iterator[Reflex]:
+    first = 0
+    for j, part in enumerate(parts):
+        for reflex in part.reflexes:
+            yield replace(reflex, name=f"joint{j + 1}.{reflex.name}", columns=first + reflex.columns)
+        first += len(part.names)
 
 
 def at_other_lengths(
@@ -347,9 +418,16 @@ def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
 
 
 def _estimates(
-    job: Job, prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement, method: int | None = None, *notes: str
+    job: Job,
+    prepared: Prepared,
+    rows: Rows,
+    fit: SlidingFit,
+    place: Placement,
+    method: int | None = None,
+    *notes: str,
+    gain: SlidingFit | None = None,
 ) -> Estimates:
-    """Judge the windows of a fit and predict what they have not seen."""
+    """Judge the windows of a fit and predict what they have not seen. `gain`: the fit that `with_gain` makes."""
     recording, model = prepared.recording, prepared.model
     starts, ahead = place.starts[: len(fit.last)], place.next_starts[: len(fit.last)]
     against = partial(score, rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta)
@@ -361,6 +439,11 @@ def _estimates(
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
     threshold, why_not = _threshold(job, prepared, place, method)
+    reflexes = () if gain is None else (_reflex(model, fit, gain),)
+    limits = job.trust
+    if reflexes and not limits.parameters:
+        # Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one.
+        limits = replace(limits, parameters=tuple(np.delete(model.names, reflexes[0].columns).tolist()))
     verdicts = judge(
         fit,
         model.names,
@@ -368,7 +451,7 @@ def _estimates(
         _parameter_scale(rows),
         prepared.column_noise,
         threshold,
-        job.trust,
+        limits,
     )
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place)
     measured = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
@@ -386,8 +469,35 @@ def _estimates(
         torque=measured.reshape(len(shown), -1),
         reconstructed=reconstructed,
         predicted=predicted,
-        notes=(*recording.notes, *filter(None, (jump_note(recording), _literal_note(job), why_not, *notes))),
+        notes=(
+            *recording.notes,
+            *filter(None, (jump_note(recording), _literal_note(job), why_not, *notes)),
+            *(_reflex_note(reflex, verdicts.trusted) for reflex in reflexes),
+        ),
+        reflexes=reflexes,
     )
+
+
+def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:
+    """Gain and delay in every window, from the weights and from the fit in which the gain is the first of them."""
+    pathway = pathway_of(model)
+    columns = np.array([model.columns.index(column) for column in pathway.columns])
+    theta, lags = np.asarray(fit.theta)[:, columns], np.array(pathway.lags)
+    total, stderr = (np.asarray(x)[:, columns[0]] for x in (gain.theta, gain.stderr))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        delay = np.where(np.abs(total) > CLEAR * stderr, theta @ lags / theta.sum(axis=1), np.nan)
+    return Reflex("reflex", model.units[columns[0]], lags, columns, total, stderr, delay)
+
+
+def _reflex_note(reflex: Reflex, trusted: NDArray[np.bool_]) -> str:
+    note = (
+        "the verdict does not look at the weights of the reflex one by one (trust.parameters can name some): those of "
+        "neighbouring lags are uncertain where their sum, the gain, is not"
+    )
+    below = reflex.gain[trusted] < -CLEAR * reflex.gain_stderr[trusted]
+    if 2 * below.sum() > len(below):
+        note += "; the gain is below zero, as of a reflex that helps the stretch: try the other direction"
+    return note
 
 
 def jump_note(recording: Recording) -> str:

@@ -203,23 +203,28 @@ def _orthonormal(rows: Float[Array, "S p"]) -> tuple[Array, Array, Array]:
 def _singular_values(R: Float[Array, "p p"]) -> Float[Array, " p"]:
     """Singular values, largest first, by one-sided Jacobi rotations: columns are turned until they are orthogonal.
 
-    Accurate for the small values too, and free of LAPACK for the reason given above.
+    Accurate for the small values too, and free of LAPACK for the reason given above. Half of the columns meet the other
+    half at a time.
     """
     p = R.shape[0]
-    first, second = (jnp.asarray(index) for index in np.triu_indices(p, 1))
+    half = (p + 1) // 2
+    if p == 1:
+        return jnp.abs(R[0])
 
-    def rotate(k: Array, A: Array) -> Array:
-        i, j = first[k % len(first)], second[k % len(first)]
-        a, b = A[:, i], A[:, j]
-        overlap = a @ b
-        ratio = (b @ b - a @ a) / (2 * jnp.where(overlap == 0, 1, overlap))
+    def rotate(_: Array, A: Array) -> Array:
+        a, b = A[:, :half], A[:, half:]
+        overlap = (a * b).sum(axis=0)
+        ratio = ((b * b).sum(axis=0) - (a * a).sum(axis=0)) / (2 * jnp.where(overlap == 0, 1, overlap))
         tangent = jnp.where(ratio < 0, -1, 1) / (jnp.abs(ratio) + jnp.sqrt(1 + ratio**2))
         tangent = jnp.where(overlap == 0, 0, tangent)
         cosine = 1 / jnp.sqrt(1 + tangent**2)
-        return A.at[:, i].set(cosine * (a - tangent * b)).at[:, j].set(cosine * (b + tangent * a))
+        a, b = cosine * (a - tangent * b), cosine * (b + tangent * a)
+        # As in a tournament: the first stays, the others move on by one place, until everyone has met everyone.
+        return jnp.concatenate([a[:, :1], b[:, :1], a[:, 1:-1], b[:, 1:], a[:, 1:][:, -1:]], axis=1)
 
-    turned = jax.lax.fori_loop(0, SWEEPS * len(first), rotate, R) if p > 1 else R
-    return jnp.sort(jnp.linalg.norm(turned, axis=0))[::-1]
+    even = jnp.pad(R, ((0, 0), (0, 2 * half - p)))
+    turned = jax.lax.fori_loop(0, SWEEPS * (2 * half - 1), rotate, even)
+    return jnp.sort(jnp.linalg.norm(turned, axis=0))[::-1][:p]
 
 
 def _inverse_of_triangle(R: Float[Array, "p p"]) -> Float[Array, "p p"]:

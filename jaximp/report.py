@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identify import Estimates
+from jaximp.identify import Estimates, Reflex
 from jaximp.job import Job
 from jaximp.least_squares import confidence_interval
 from jaximp.models import HumanJoint, Joints, Model
@@ -50,6 +50,8 @@ CAPTIONS = {
     "parameters apart. Where the held-out VAF falls below the other, the parameters change or fit noise.",
     "residual_spectrum": "What the model leaves over, by frequency. A peak that the torque has as well is something "
     "that the model lacks; a flat floor is noise.",
+    "reflex": "What a stretch does to the torque as time goes by: the weight of every lag of the rectified velocity. "
+    "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
     "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "
     "spread well above the standard error is a true change, or something that the model lacks.",
     "methods": "The same windows by several methods of telling the human from the robot.",
@@ -88,11 +90,13 @@ def draw_figures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimate
     """All figures of a report as PNG files, drawn once for the folder and the page."""
     main = estimates_list[0]
     figures = {
-        "parameters": plots.parameters_over_time(main),
+        "parameters": plots.parameters_over_time(main.summarised()),
         "torque": plots.torque(main),
         "condition": plots.condition_over_time(main),
         "residual_spectrum": plots.residual_spectrum(main),
     }
+    if main.reflexes:
+        figures["reflex"] = plots.reflex_weights(main)
     if lengths:
         figures["window_lengths"] = plots.window_lengths(lengths)
     if len(estimates_list) > 1:
@@ -178,6 +182,12 @@ def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | 
         for part in _human_parts(estimates, human_model)
         if part.model.offset
     ]
+    for reflex in estimates.reflexes:
+        columns += [
+            (f"{reflex.name}_gain", reflex.unit, reflex.gain),
+            (f"{reflex.name}_gain_stderr", reflex.unit, reflex.gain_stderr),
+            (f"{reflex.name}_delay", "s", reflex.delay),
+        ]
     efforts = {plots.effort(estimates, joint)[1] for joint in range(estimates.torque.shape[1])}
     columns += [
         ("condition", "1", fit.cond),
@@ -241,6 +251,7 @@ def _result(estimates: Estimates, human: Model | None) -> dict[str, Any]:
         "step_s": float(np.median(step)) if len(step) else None,
         "parameters": _parameters(estimates, np.ones(len(estimates.names))),
         "equilibrium": _equilibria(parts, trusted, geared=False),
+        "reflex": {reflex.name: _reflex(reflex, estimates) for reflex in estimates.reflexes},
         "at_joint": _at_joint(estimates, parts),
         "windows": {
             "count": len(trusted),
@@ -267,11 +278,14 @@ def _at_joint(estimates: Estimates, parts: list[_HumanPart]) -> dict[str, Any] |
     for part in parts:
         factor[part.columns] = part.factor
     equilibrium = _equilibria(parts, estimates.verdicts.trusted, geared=True)
-    return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium}
+    reflex = {reflex.name: _reflex(reflex, estimates, factor) for reflex in estimates.reflexes}
+    return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium, "reflex": reflex}
 
 
 def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
-    """Every parameter over the trusted windows, times a factor."""
+    """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
+    factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
+    estimates = estimates.summarised()
     fit, trusted = estimates.fit, estimates.verdicts.trusted
     theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
     low, high = confidence_interval(jnp.asarray(theta), jnp.asarray(stderr), fit.dof)
@@ -284,6 +298,24 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
             "half_width_95": _median((high - low)[trusted, k] / 2),
         }
         for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True))
+    }
+
+
+def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | None = None) -> dict[str, Any]:
+    """Delay and weights of a reflex over the trusted windows. The delay is a quotient: its median is told, no error."""
+    trusted, scale = estimates.verdicts.trusted, 1.0 if factor is None else factor[reflex.columns[0]]
+    theta, stderr = (scale * np.asarray(x)[:, reflex.columns] for x in (estimates.fit.theta, estimates.fit.stderr))
+    low, high = confidence_interval(jnp.asarray(theta), jnp.asarray(stderr), estimates.fit.dof)
+    delay = reflex.delay[trusted]
+    return {
+        "delay": {"unit": "s", "median": _median(delay[np.isfinite(delay)]), "sd": _spread(delay[np.isfinite(delay)])},
+        "lags_s": reflex.lags.tolist(),
+        "weights": {
+            "unit": reflex.unit,
+            "mean": [_mean(column) for column in theta[trusted].T],
+            "sd": [_spread(column) for column in theta[trusted].T],
+            "half_width_95": [_median(column) for column in (high - low)[trusted].T / 2],
+        },
     }
 
 

@@ -23,7 +23,7 @@ from jaximp.models.endpoint import (
 )
 from jaximp.models.joint import HumanJoint, RobotJoint, parameter_units
 from jaximp.models.kinematics import ArmGeometry, solve_pair
-from jaximp.models.reflex import ReflexGain, ReflexPathway, pathway_of, reflex_gain
+from jaximp.models.reflex import ReflexGain, ReflexPathway, pathway_of, reflex_gain, with_gain
 
 __all__ = [
     "MOTION",
@@ -57,4 +57,5 @@ __all__ = [
     "reflex_gain",
     "rigid_body_torque",
     "solve_pair",
+    "with_gain",
 ]

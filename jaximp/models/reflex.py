@@ -176,3 +176,14 @@ def pathway_of(model: Model) -> ReflexPathway:
         parts += [getattr(part, name, None) for name in ("reflex", "first", "second")]
         parts = [one for one in parts if one is not None]
     raise ValueError("the model has no reflex: give HumanJoint one, reflex=ReflexPathway(sample_rate)")
+
+
+def with_gain(model: Model, W: Num[AnyArray, "*N p"]) -> Float[Array, "*N p"]:
+    """The same regressor for other parameters: the gain of the reflex in place of its first weight.
+
+    Whatever solves for the parameters gives the gain's standard error so, without their covariance.
+    """
+    pathway = pathway_of(model)
+    first, *others = (model.columns.index(column) for column in pathway.columns)
+    W, rest = jnp.asarray(W), jnp.array(others, int)
+    return W.at[..., rest].add(-W[..., first, None]).at[..., first].multiply(pathway.direction)

@@ -33,6 +33,7 @@ from jaximp.plots.style import (
     main_parameter,
     mean_of,
     number,
+    pretty_unit,
     remark,
     styled,
     with_unit,
@@ -139,6 +140,45 @@ def residual_spectrum(estimates: Estimates) -> Figure:
         panel.set(xlabel="frequency [Hz]", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
         _spectra(panel, estimates, joint)
     _legend(figure, max(panels, key=lambda panel: len(panel.get_lines())), [])
+    return figure
+
+
+@styled
+def reflex_weights(estimates: Estimates, level: float = 0.95) -> Figure:
+    """Weight of every lag of each reflex: mean over the trusted windows, its interval in one window, and the spread."""
+    figure = Figure(figsize=(WIDTH, 2.6 * len(estimates.reflexes)))
+    panels = figure.subplots(len(estimates.reflexes), 1, squeeze=False)[:, 0]
+    trusted = estimates.verdicts.trusted
+    for panel, reflex in zip(panels, estimates.reflexes, strict=True):
+        theta = np.asarray(estimates.fit.theta)[:, reflex.columns]
+        half = _interval(estimates, level)[1][:, reflex.columns] - theta
+        lags = 1e3 * reflex.lags
+        panel.set(xlabel="lag behind the velocity [ms]", ylabel=f"weight [{pretty_unit(reflex.unit)}]")
+        panel.axhline(0, color=PALE, linewidth=0.8)
+        if not trusted.any():
+            remark(panel, "no window can be trusted", VERMILLION)
+            continue
+        mean, spread = theta[trusted].mean(axis=0), theta[trusted].std(axis=0)
+        one = np.median(half[trusted], axis=0)
+        panel.fill_between(
+            lags,
+            mean - one,
+            mean + one,
+            color=BLUE,
+            alpha=0.2,
+            linewidth=0,
+            label=f"{level:.0%} interval of one window",
+        )
+        panel.errorbar(
+            lags, mean, spread, color=BLUE, marker=".", linewidth=1, capsize=2, label="mean, sd over windows"
+        )
+        whose = reflex.name.removesuffix("reflex").replace(".", ": ")
+        title = f"{whose}gain {number(float(reflex.gain[trusted].mean()), 3)} {pretty_unit(reflex.unit)}"
+        known = reflex.delay[trusted & np.isfinite(reflex.delay)]
+        if len(known):
+            title += f", mean delay {number(1e3 * float(np.median(known)), 3)} ms"
+        panel.set_title(title, loc="left")
+    _legend(figure, panels[0], [])
     return figure
 
 
