@@ -10,6 +10,16 @@ from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, lea
 from jaximp.movement_trials import judge_sensors, read_movements, read_postures
 from jaximp.movements import Handle, Movements
 from jaximp.perturbations import Perturbations, design_perturbations
+from jaximp.posterior import (
+    ExactPosterior,
+    Posterior,
+    PosteriorMany,
+    derive,
+    exact_posterior,
+    probability_greater,
+    summarise,
+)
+from jaximp.posterior_files import load_posterior, save_posterior, to_inference_data
 from jaximp.recordings import (
     load_recording,
     load_trial_table,
@@ -18,6 +28,7 @@ from jaximp.recordings import (
     save_trial_table,
 )
 from jaximp.recursive import RecursiveFit, recursive_least_squares
+from jaximp.samplers import sample_many, sample_posterior
 from jaximp.stiffness import (
     LinearFit,
     StiffnessFit,
@@ -39,6 +50,7 @@ __all__ = [
     "Design",
     "Encoder",
     "Estimates",
+    "ExactPosterior",
     "FilterSettings",
     "FourierSeries",
     "Handle",
@@ -49,6 +61,8 @@ __all__ = [
     "MinimumJerk",
     "Movements",
     "Perturbations",
+    "Posterior",
+    "PosteriorMany",
     "RaisedSine",
     "Recording",
     "RecursiveFit",
@@ -61,8 +75,10 @@ __all__ = [
     "at_rest",
     "confidence",
     "confidence_interval",
+    "derive",
     "design_excitation",
     "design_perturbations",
+    "exact_posterior",
     "fit_stiffness",
     "fit_stiffness_linear",
     "fit_trials",
@@ -76,6 +92,7 @@ __all__ = [
     "joint_trials",
     "judge_sensors",
     "least_squares",
+    "load_posterior",
     "load_recording",
     "load_trial_table",
     "load_trials",
@@ -83,6 +100,7 @@ __all__ = [
     "models",
     "parse_job",
     "predict_trials",
+    "probability_greater",
     "read_job",
     "read_movements",
     "read_postures",
@@ -91,9 +109,14 @@ __all__ = [
     "recursive_least_squares",
     "regress_trials",
     "residual_triangle",
+    "sample_many",
+    "sample_posterior",
+    "save_posterior",
     "save_recording",
     "save_trial_table",
     "sliding_least_squares",
     "sliding_pieces",
     "sliding_theta",
+    "summarise",
+    "to_inference_data",
 ]

@@ -18,15 +18,19 @@ from jaximp.plots.estimates import (
     window_lengths,
 )
 from jaximp.plots.impedance import deviations, impedance_methods, impedance_windows, jerk_spectra, joint_torques
+from jaximp.plots.posterior import bands, corner, ellipse_bands
 from jaximp.plots.style import Panel, curves, main_parameter, number, png, pretty_unit, with_unit, words
 
 __all__ = [
     "Panel",
+    "bands",
     "condition_over_time",
+    "corner",
     "curves",
     "design",
     "deviations",
     "effort",
+    "ellipse_bands",
     "ellipses",
     "impedance_methods",
     "impedance_windows",

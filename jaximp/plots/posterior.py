@@ -1,0 +1,212 @@
+"""Figures of posteriors: parameters pair by pair, over time, and ellipses of stiffness and damping."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
+
+from jaximp.plots.style import BLACK, BLUE, VERMILLION, WIDTH, cycle, draw_band, draw_line, pretty_unit, styled, words
+from jaximp.plots.style import LINES as STYLES
+from jaximp.posterior import Posterior, PosteriorMany, index_of
+from jaximp.types import AnyArray, Numbers
+
+BANDS = (0.95, 0.5)
+"""Probability within each shade, the palest first."""
+SHADES = (0.22, 0.35)
+"""Opacity of each shade; they lie on top of each other."""
+CELLS = 60
+"""Of a two-dimensional histogram, along each parameter."""
+SMOOTH = 1.4
+"""Cells: standard deviation of what smooths the histogram, so that contours are lines and not islands."""
+SPAN = 0.001
+"""Share of the draws left out at either end of an axis."""
+RAYS = 181
+"""Directions in which ellipses are held against each other."""
+
+
+@styled
+def corner(
+    posterior: Posterior,
+    names: Sequence[str] | None = None,
+    *,
+    truth: Mapping[str, float] | None = None,
+    other: Posterior | None = None,
+) -> Figure:
+    """Every parameter's marginal, and every pair's regions of highest density that hold 50 and 95 %.
+
+    **Arguments:** `names` of the parameters shown, all without it; `truth` is drawn as black lines; `other` another
+    posterior, drawn in outline over it.
+    """
+    names = list(names or posterior.names)
+    columns = [index_of(posterior.names, name) for name in names]
+    draws = posterior.samples[:, columns]
+    limits = np.quantile(draws, [SPAN, 1 - SPAN], axis=0)
+    second = None
+    if other is not None:
+        second = other.samples[:, [index_of(other.names, name) for name in names]]
+        ends = np.quantile(second, [SPAN, 1 - SPAN], axis=0)
+        limits = np.stack([np.minimum(limits[0], ends[0]), np.maximum(limits[1], ends[1])])
+    n = len(names)
+    figure = Figure(figsize=(WIDTH, WIDTH if n > 2 else WIDTH * 0.7))
+    panels = figure.subplots(n, n, squeeze=False)
+    for i in range(n):
+        for j in range(n):
+            panel = panels[i, j]
+            if j > i:
+                panel.remove()
+                continue
+            panel.grid(False)
+            if i == j:
+                _marginal(panel, draws[:, i], limits[:, i], filled=True)
+                if second is not None:
+                    _marginal(panel, second[:, i], limits[:, i], filled=False)
+            else:
+                _region(panel, draws[:, [j, i]], limits[:, [j, i]], filled=True)
+                if second is not None:
+                    _region(panel, second[:, [j, i]], limits[:, [j, i]], filled=False)
+            _truths(panel, truth or {}, names[j], names[i] if i != j else None)
+            _ticks(panel, [posterior.names[columns[k]] for k in (j, i)], [posterior.units[columns[k]] for k in (j, i)])
+            _outer_only(panel, i, j, n)
+    figure.align_labels()
+    return figure
+
+
+def _marginal(panel: Axes, x: Numbers, limits: Numbers, filled: bool) -> None:
+    edges = np.linspace(limits[0], limits[1], CELLS + 1)
+    density = gaussian_filter(np.histogram(x, edges)[0].astype(float), SMOOTH, mode="nearest")
+    middle = (edges[1:] + edges[:-1]) / 2
+    if not filled:
+        panel.plot(middle, density / density.max(), color=VERMILLION, linewidth=1.0, linestyle="--")
+        return
+    for share, shade in zip(BANDS, SHADES, strict=True):
+        low, high = np.quantile(x, [0.5 - share / 2, 0.5 + share / 2])
+        within = (middle >= low) & (middle <= high)
+        panel.fill_between(middle[within], density[within] / density.max(), color=BLUE, alpha=shade, linewidth=0)
+    panel.plot(middle, density / density.max(), color=BLUE, linewidth=1.0)
+    panel.set(xlim=tuple(limits), ylim=(0, 1.08))
+
+
+def _region(panel: Axes, xy: Numbers, limits: Numbers, filled: bool) -> None:
+    """Contours of a smoothed histogram, at the heights above which lie 50 and 95 % of the draws."""
+    edges = [np.linspace(limits[0, k], limits[1, k], CELLS + 1) for k in (0, 1)]
+    density = gaussian_filter(np.histogram2d(xy[:, 0], xy[:, 1], bins=edges)[0], SMOOTH, mode="nearest").T
+    x, y = ((edge[1:] + edge[:-1]) / 2 for edge in edges)
+    falling = np.sort(density, axis=None)[::-1]
+    held = np.cumsum(falling) / falling.sum()
+    levels = [float(falling[np.searchsorted(held, share)]) for share in BANDS]
+    if not 0 < levels[0] < levels[1] < falling[0]:
+        panel.plot(*xy.T, ".", color=BLUE, markersize=1)
+    elif filled:
+        for level, shade in zip(levels, SHADES, strict=True):
+            panel.contourf(x, y, density, [level, falling[0]], colors=[BLUE], alpha=shade)
+        panel.contour(x, y, density, levels, colors=[BLUE], linewidths=0.8)
+    else:
+        panel.contour(x, y, density, levels, colors=[VERMILLION], linewidths=0.9, linestyles="--")
+    panel.set(xlim=tuple(limits[:, 0]), ylim=tuple(limits[:, 1]))
+
+
+def _truths(panel: Axes, truth: Mapping[str, float], x: str, y: str | None) -> None:
+    if x in truth:
+        panel.axvline(truth[x], color=BLACK, linewidth=0.8)
+    if y is not None and y in truth:
+        panel.axhline(truth[y], color=BLACK, linewidth=0.8)
+
+
+def _ticks(panel: Axes, names: Sequence[str], units: Sequence[str]) -> None:
+    """Three numbers at most, slanted, and names as short as they are."""
+    panel.locator_params(nbins=3)
+    panel.tick_params(axis="x", rotation=40)
+    labels = [f"{words(name)}\n[{pretty_unit(unit)}]" for name, unit in zip(names, units, strict=True)]
+    panel.set(xlabel=labels[0], ylabel=labels[1])
+
+
+def _outer_only(panel: Axes, i: int, j: int, n: int) -> None:
+    if i < n - 1:
+        panel.set_xlabel("")
+        panel.tick_params(labelbottom=False)
+    if i == j:
+        panel.set_ylabel("")
+        panel.set_yticks([])
+        panel.spines["left"].set_visible(False)
+    elif j > 0:
+        panel.set_ylabel("")
+        panel.tick_params(labelleft=False)
+
+
+@styled
+def bands(
+    time: Numbers,
+    posteriors: PosteriorMany,
+    names: Sequence[str] | None = None,
+    *,
+    truth: Mapping[str, Numbers] | None = None,
+) -> Figure:
+    """Parameters over time [s]: medians, with bands that hold 50 and 95 %.
+
+    A window whose draws cannot be trusted is left out. `truth` holds values over the same time, drawn in black.
+    """
+    names = list(names or posteriors.names)
+    trusted = posteriors.ok
+    figure = Figure(figsize=(WIDTH, 1.7 * len(names) + 0.4))
+    panels = figure.subplots(len(names), 1, squeeze=False, sharex=True)[:, 0]
+    for panel, name in zip(panels, names, strict=True):
+        k = index_of(posteriors.names, name)
+        draws = np.where(trusted[:, None], posteriors.samples[..., k], np.nan)
+        for share, shade in zip(BANDS, SHADES, strict=True):
+            ends = np.full((2, len(draws)), np.nan)
+            ends[:, trusted] = np.quantile(draws[trusted], [0.5 - share / 2, 0.5 + share / 2], axis=1)
+            draw_band(panel, time, *ends, color=BLUE, alpha=shade, linewidth=0, label=f"{share:.0%} band")
+        draw_line(panel, time, np.median(draws, axis=1), color=BLUE, label="median")
+        if truth is not None and name in truth:
+            draw_line(panel, time, truth[name], color=BLACK, linestyle="--", linewidth=0.9, label="truth")
+        panel.set_ylabel(f"{words(name)}\n[{pretty_unit(posteriors.units[k])}]")
+    panels[-1].set_xlabel("time [s]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    figure.align_ylabels(panels)
+    return figure
+
+
+@styled
+def ellipse_bands(matrices: Mapping[str, Mapping[str, AnyArray]], units: Mapping[str, str] | None = None) -> Figure:
+    """Ellipses of stiffness, damping, ... with bands that hold 50 and 95 % of the draws in every direction.
+
+    The ellipse is `K u` of unit displacements u, drawn by its radius in each direction; of matrices that are not
+    symmetric the symmetric part.
+
+    **Arguments:** for each quantity, such as `stiffness`, draws (draws, 2, 2) by name, such as the state of the arm;
+    `units` by quantity.
+    """
+    figure = Figure(figsize=(WIDTH, WIDTH / max(2, len(matrices)) + 0.4))
+    panels = figure.subplots(1, len(matrices), squeeze=False)[0]
+    angle = np.linspace(0, 2 * np.pi, 2 * RAYS - 1)
+    rays = np.stack([np.cos(angle), np.sin(angle)])
+    handles = {}
+    for panel, (quantity, named) in zip(panels, matrices.items(), strict=True):
+        largest = 0.0
+        for (name, draws), (color, _) in zip(named.items(), cycle(STYLES, len(named)), strict=True):
+            radius = _radius(np.asarray(draws), rays)
+            for share, shade in zip(BANDS, SHADES, strict=True):
+                low, high = np.quantile(radius, [0.5 - share / 2, 0.5 + share / 2], axis=0)
+                outline = np.concatenate([rays * high, (rays * low)[:, ::-1]], axis=1)
+                panel.fill(*outline, color=color, alpha=shade, linewidth=0)
+                largest = max(largest, float(high.max()))
+            handles[name] = panel.plot(*(rays * np.median(radius, axis=0)), color=color, label=name)[0]
+        unit = f" [{pretty_unit(units[quantity])}]" if units and quantity in units else ""
+        room = 1.08 * largest
+        panel.set(title=quantity, xlabel=f"joint 1{unit}", xlim=(-room, room), ylim=(-room, room), aspect="equal")
+    panels[0].set_ylabel("joint 2")
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, len(handles)))
+    return figure
+
+
+def _radius(draws: Numbers, rays: Numbers) -> Numbers:
+    """(draws, directions) how far the ellipse `{K u, |u| = 1}` reaches; zero across a singular matrix."""
+    K = (draws + draws.swapaxes(1, 2)) / 2
+    determinant = K[:, 0, 0] * K[:, 1, 1] - K[:, 0, 1] ** 2
+    adjugate = np.stack([np.stack([K[:, 1, 1], -K[:, 0, 1]], -1), np.stack([-K[:, 0, 1], K[:, 0, 0]], -1)], -2)
+    length = np.linalg.norm(adjugate @ rays, axis=1)
+    return np.abs(determinant)[:, None] / np.where(length > 0, length, 1)
