@@ -54,6 +54,19 @@ def triangle(columns: Float[Array, "p N"]) -> Float[Array, "p p"]:
     return jax.lax.fori_loop(0, p, add_row, (columns, jnp.zeros((p, p), columns.dtype)))[1]
 
 
+def cholesky(H: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Bool[Array, ""]]:
+    """Upper triangle R with `R' R = H`, and whether H is positive definite; where it is not, R is not to be used."""
+    p = len(H)
+
+    def add_row(j: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        left, R, definite = state
+        positive = left[j, j] > 0
+        row = jnp.where(jnp.arange(p) >= j, left[j], 0) / jnp.sqrt(jnp.where(positive, left[j, j], 1))
+        return keep((left - row[:, None] * row, R.at[j].set(row), definite & positive))
+
+    return jax.lax.fori_loop(0, p, add_row, (H, jnp.zeros_like(H), jnp.array(True)))[1:]
+
+
 def back_substitute(R: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
     """`x` with `R x = right`, from the upper triangle alone; zero where a pivot is."""
     p = len(right)

@@ -262,13 +262,13 @@ def _one_problem(triangles: Array, samples: Array, counts: Array, elements: NDAr
     p, n_samples = elements.shape[1], jnp.where(counts, samples, 0).sum()
     finite = (jnp.isfinite(triangles).all(axis=(1, 2)) | ~counts).all()
     triangles = jnp.where((counts & finite)[:, None, None], triangles, 0)
-    whole = triangle(_design(triangle(triangles.reshape(-1, 6).T), elements))
+    whole = triangle(element_columns(triangle(triangles.reshape(-1, 6).T), elements))
     R, right = whole[:p, :p], whole[:p, p]
     negligible = jnp.maximum(n_samples, 12) * jnp.finfo(R.dtype).eps
     determined = (jnp.diagonal(R) > negligible * jnp.sqrt((R**2).sum(axis=0))).all()
     R = jnp.where(determined, R, jnp.eye(p, dtype=R.dtype))
     linear, given = back_substitute(R, right), elements[_given(8 if elements is EIGHT else 7)]
-    covariance = _jackknife(R, jax.vmap(partial(_design, elements=elements))(triangles), linear, counts)
+    covariance = _jackknife(R, jax.vmap(partial(element_columns, elements=elements))(triangles), linear, counts)
     return _Problem(
         R=R,
         right=right,
@@ -358,7 +358,7 @@ def _times(a: AnyArray, b: AnyArray) -> Array:
     return jnp.matmul(jnp.asarray(a), jnp.asarray(b), precision="highest")
 
 
-def _design(R: Array, elements: NDArray[np.float64]) -> Array:
+def element_columns(R: Array, elements: NDArray[np.float64]) -> Array:
     """(p + 1, 12) columns of the parameters and of the torque: six rows for each joint."""
     zero = jnp.zeros_like(R[:, 0])
     column = {

@@ -1,0 +1,185 @@
+"""What is known of parameters before the data: nothing, or a normal or log-normal distribution from anatomy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+from jaximp.types import AnyArray, Numbers, nearest
+
+
+@dataclass(frozen=True)
+class Normal:
+    """A parameter known as `mean` give or take the standard deviation `sd`, in its own unit."""
+
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class LogNormal:
+    """A positive parameter, with even odds above `median`, and with 68 % within a `factor` of it."""
+
+    median: float
+    factor: float
+
+
+@dataclass(frozen=True, eq=False)
+class MultivariateNormal:
+    """Parameters that were estimated before, such as a robot's from its own recording."""
+
+    names: tuple[str, ...]
+    mean: AnyArray
+    """(k,)"""
+    covariance: AnyArray
+    """(k, k)"""
+
+
+class Prior(eqx.Module):
+    """Independent of the data: flat in every parameter that is not `proper`."""
+
+    mean: Float[AnyArray, "*M p"]
+    """Of the parameters, or of their logarithms."""
+    root: Float[AnyArray, "*M p p"]
+    """The precision is root' root; rows of zeros are flat."""
+    constant: Float[AnyArray, "*M"]
+    """Which makes the proper part integrate to one."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    """Parameters that are log-normal, and so positive."""
+    proper: tuple[bool, ...] = eqx.field(static=True)
+
+    def log_density(self, x: Num[AnyArray, " p"]) -> Float[Array, ""]:
+        """Of the parameters `x`, -inf where one of them is impossible."""
+        logarithmic, x = np.array(self.logarithmic), jnp.asarray(x)
+        possible = (~logarithmic | (x > 0)).all()
+        logs = jnp.log(jnp.where(logarithmic & (x > 0), x, 1))
+        distance = (self.root * (jnp.where(logarithmic, logs, x) - self.mean)).sum(axis=1)
+        return jnp.where(possible, self.constant - (distance**2).sum() / 2 - logs.sum(), -jnp.inf)
+
+    def information(self) -> Numbers:
+        """(p, p) what it adds to the information of the data, at the median of what is log-normal."""
+        mean = np.asarray(self.mean)
+        root = np.asarray(self.root) / np.where(self.logarithmic, np.exp(mean), 1)
+        return np.asarray(root.T @ root)
+
+    def draws(self, n: int, generator: np.random.Generator) -> Numbers:
+        """(n, p) of the proper parameters; NaN of the flat ones."""
+        proper = np.flatnonzero(self.proper)
+        x = np.full((n, len(self.names)), np.nan)
+        root = np.asarray(self.root)[np.ix_(proper, proper)]
+        x[:, proper] = np.asarray(self.mean)[proper] + np.linalg.solve(root, generator.normal(size=(len(proper), n))).T
+        return np.where(self.logarithmic, np.exp(x), x)
+
+
+def make_prior(
+    names: Sequence[str],
+    given: Mapping[str, Normal | LogNormal] | None = None,
+    blocks: Sequence[MultivariateNormal] = (),
+) -> Prior:
+    """A prior that is flat in all parameters but those that are given one.
+
+    **Raises:** ValueError for a name that does not exist or comes twice, and for impossible distributions.
+    """
+    given = {} if given is None else given
+    names, p = tuple(names), len(names)
+    mean, root, constant = np.zeros(p), np.zeros((p, p)), 0.0
+    logarithmic, proper = np.zeros(p, bool), np.zeros(p, bool)
+    for name, one in given.items():
+        k = _free(names, name, proper)
+        mean[k], sd = _checked(name, one)
+        root[k, k], proper[k], logarithmic[k] = 1 / sd, True, isinstance(one, LogNormal)
+        constant -= np.log(sd) + np.log(2 * np.pi) / 2
+    for block in blocks:
+        index = []
+        for name in block.names:
+            index.append(_free(names, name, proper))
+            proper[index[-1]] = True
+        factor = _checked_block(block)
+        mean[index], root[np.ix_(index, index)] = np.asarray(block.mean), np.linalg.inv(factor)
+        constant -= np.log(np.diagonal(factor)).sum() + len(index) * np.log(2 * np.pi) / 2
+    plain = tuple(logarithmic.tolist()), tuple(proper.tolist())
+    return Prior(mean, root, np.asarray(constant), names, *plain)
+
+
+def _free(names: tuple[str, ...], name: str, proper: np.ndarray) -> int:
+    if name not in names:
+        raise ValueError(f"the prior of '{name}' belongs to no parameter: {nearest(name, list(names))}")
+    if proper[names.index(name)]:
+        raise ValueError(f"'{name}' has two priors: give it one")
+    return names.index(name)
+
+
+def _checked(name: str, one: Normal | LogNormal) -> tuple[float, float]:
+    """Mean and standard deviation, of the logarithm if it is log-normal."""
+    if isinstance(one, LogNormal):
+        if name.startswith("log_"):
+            raise ValueError(f"'{name}' is a logarithm and may be negative: give it a normal prior")
+        if not (0 < one.median < np.inf and 1 < one.factor < np.inf):
+            raise ValueError(
+                f"the log-normal prior of '{name}' has median {one.median:g} and factor {one.factor:g}: the median must "
+                "be above zero and the factor above one"
+            )
+        return float(np.log(one.median)), float(np.log(one.factor))
+    if not (np.isfinite(one.mean) and 0 < one.sd < np.inf):
+        raise ValueError(f"the normal prior of '{name}' has mean {one.mean:g} and sd {one.sd:g}: sd must be above zero")
+    return float(one.mean), float(one.sd)
+
+
+def _checked_block(block: MultivariateNormal) -> Numbers:
+    """Lower Cholesky factor of its covariance."""
+    mean, covariance, k = np.asarray(block.mean, float), np.asarray(block.covariance, float), len(block.names)
+    these = ", ".join(block.names)
+    if mean.shape != (k,) or covariance.shape != (k, k):
+        raise ValueError(f"the prior of {these} needs a mean of shape ({k},) and a covariance of ({k}, {k})")
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+        raise ValueError(f"the prior of {these} is not finite: was there an estimate?")
+    size = np.sqrt(np.abs(np.diagonal(covariance)))  # numpy takes it for singular if units differ much
+    size = np.where(size > 0, size, 1)
+    try:
+        factor = np.linalg.cholesky(covariance / np.outer(size, size))
+    except np.linalg.LinAlgError:
+        factor = None
+    if factor is None or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
+        raise ValueError(f"the covariance in the prior of {these} must be symmetric and positive definite")
+    return np.asarray(size[:, None] * factor)
+
+
+@dataclass(frozen=True)
+class PriorPredictive:
+    """What torque a prior expects, against the measured one."""
+
+    ratio: tuple[float, float, float]
+    """Root mean square of the torque that the prior expects over that of the measured one: 5, 50 and 95 % of draws.
+    NaN where all is flat. Far from one on both sides of it, the prior and the recording contradict each other."""
+    flat: tuple[str, ...]
+    """Parameters about which the prior says nothing, and that took no part."""
+
+
+def prior_predictive(
+    prior: Prior,
+    W: Num[AnyArray, "S *n p"],
+    torque: Num[AnyArray, "S *n"],
+    draws: int = 1000,
+    seed: int = 0,
+) -> PriorPredictive:
+    """The size of the torque that the proper part of a prior implies for a recorded motion.
+
+    **Arguments:** `W` (S, p) or (S, n, p) for the first p parameters of the prior; the measured torque (S,) or (S, n).
+    """
+    W = np.asarray(W, float)
+    p = W.shape[-1]
+    flat = tuple(name for name, proper in zip(prior.names, prior.proper, strict=True) if not proper)
+    known = np.flatnonzero(prior.proper[:p])
+    if not len(known):
+        return PriorPredictive((np.nan, np.nan, np.nan), flat)
+    x = prior.draws(draws, np.random.default_rng(seed))[:, known]
+    R = np.linalg.qr(W.reshape(-1, p)[:, known], mode="r")
+    size = np.linalg.norm(x @ R.T, axis=1) / np.linalg.norm(torque)
+    low, middle, high = (float(q) for q in np.quantile(size, [0.05, 0.5, 0.95]))
+    return PriorPredictive((low, middle, high), flat)
