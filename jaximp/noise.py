@@ -36,6 +36,9 @@ SIGNIFICANCE = 0.01
 """Residuals whose whiteness is less likely than this are given an autoregression."""
 LAGS = 20
 """Lags that are tested for whiteness, and at most a fifth of the rows."""
+ATTENUATION = 0.25
+"""Noise in the regressor is corrected for where it moves an estimate by this many standard errors: 95 % intervals then
+hold the truth in 94.3 % of all cases."""
 PLAIN = np.ones(1)
 
 
@@ -226,6 +229,83 @@ def fit_autoregression(residual: Num[AnyArray, " R"], valid: Shaped[AnyArray, " 
     order = int(np.argmin([lost(k) for k in range(most + 1)]))
     enough = _history(valid, order)
     return np.asarray(np.linalg.lstsq(past[enough, :order], e[enough])[0]) if order else np.zeros(0)
+
+
+def whitened_covariance(
+    difference: Num[AnyArray, "S *n p"],
+    noise: Noise | Num[AnyArray, " L"] | None = None,
+    valid: Shaped[AnyArray, "S *n"] | None = None,
+) -> Numbers:
+    """(n, p, p) covariance that errors of the regressor have in the rows that `whiten` makes with the same arguments.
+
+    **Arguments:** `difference` of a regressor with and without such errors (`regression.noisy_columns`).
+    """
+    difference = np.asarray(difference, float)
+    rows = whiten(difference, np.zeros(difference.shape[:-1]), noise, valid)
+    return np.einsum("rni,rnj->nij", rows.W, rows.W) / np.maximum(rows.count, 1)[:, None, None]
+
+
+def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"]) -> Numbers:
+    """(p,) bias of least squares by noise in the regressor, in standard errors: `-inv(W'W) S Sigma theta`.
+
+    **Source:** Fuller 1987, Measurement error models, section 2.2.
+    """
+    theta, scale = _optimum_and_scale(rows)
+    weight = 1 / scale**2
+    p = len(theta)
+    gram = np.einsum("rni,rnj,n->ij", rows.W, rows.W, weight)
+    lost = np.einsum("nij,n->ij", _covariances(column_noise, len(scale), p), weight * rows.count)
+    size = np.sqrt(np.diagonal(gram))
+    size = np.where(size > 0, size, 1)
+    inverse = np.linalg.pinv(gram / np.outer(size, size)) / np.outer(size, size)
+    return np.asarray(-(inverse @ lost @ theta) / np.sqrt(np.diagonal(inverse)))
+
+
+def corrected(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"]) -> Numbers:
+    """(n, p + 1, p + 1) rows that stand for those of a regressor without its noise.
+
+    Their Gram matrix is `W'W - S Sigma`, so that the bias is gone, and what they leave of the torque at the optimum is
+    what is left there in truth: the torque's noise and that of the regressor, of variance s^2 + theta' Sigma theta,
+    the square of the density's noise. Right up to terms of second order in Sigma.
+
+    **Raises:** ValueError where the noise is as large as the motion.
+
+    **Source:** Fuller 1987, section 2.2; Nakamura 1990 for the corrected likelihood.
+    """
+    n, p = len(rows.count), rows.W.shape[-1]
+    out = np.zeros((n, p + 1, p + 1))
+    for k, (sigma, count) in enumerate(zip(_covariances(column_noise, n, p), rows.count, strict=True)):
+        W, y = rows.W[:, k], rows.y[:, k]
+        size = np.linalg.norm(W, axis=0)
+        size = np.where(size > 0, size, 1)
+        values, vectors = np.linalg.eigh((W / size).T @ (W / size) - count * sigma / np.outer(size, size))
+        if values[0] < -1e-12:
+            raise ValueError(
+                "the noise of the motion is as large as the motion in some direction of the regressor: excite more, or "
+                "lower filter.position_cutoff"
+            )
+        known = values > 1e-12  # what this output does not depend on is zero
+        root = np.sqrt(np.where(known, values, 0))
+        along = np.where(known, vectors.T @ (W / size).T @ y / np.where(known, root, 1), 0)
+        theta = vectors @ np.where(known, along / np.where(known, root, 1), 0) / size
+        out[k, :p, :p], out[k, :p, p] = root[:, None] * vectors.T * size, along
+        out[k, p, p] = np.linalg.norm(y - W @ theta)
+    return out
+
+
+def _optimum_and_scale(rows: WhiteRows) -> tuple[Numbers, Numbers]:
+    """Least squares, and the scale of the noise in each output."""
+    theta = optimum(rows)
+    scale = np.linalg.norm(residuals(rows, theta), axis=0) / np.sqrt(np.maximum(rows.count, 1))
+    return theta, np.where(scale > 0, scale, 1)
+
+
+def _covariances(column_noise: AnyArray, n: int, p: int) -> Numbers:
+    """(n, p, p), from any way to state it."""
+    given = np.asarray(column_noise, float)
+    if given.shape not in ((p,), (p, p), (n, p, p)):
+        raise ValueError(f"column_noise has the shape {given.shape}: it must be ({p},), ({p}, {p}) or ({n}, {p}, {p})")
+    return np.broadcast_to(np.diag(given**2) if given.ndim == 1 else given, (n, p, p))
 
 
 def _past(x: Numbers, order: int) -> Numbers:

@@ -122,8 +122,8 @@ def _checked(name: str, one: Normal | LogNormal) -> tuple[float, float]:
             raise ValueError(f"'{name}' is a logarithm and may be negative: give it a normal prior")
         if not (0 < one.median < np.inf and 1 < one.factor < np.inf):
             raise ValueError(
-                f"the log-normal prior of '{name}' has median {one.median:g} and factor {one.factor:g}: the median must "
-                "be above zero and the factor above one"
+                f"the log-normal prior of '{name}' has median {one.median:g} and factor {one.factor:g}: the median "
+                "must be above zero and the factor above one"
             )
         return float(np.log(one.median)), float(np.log(one.factor))
     if not (np.isfinite(one.mean) and 0 < one.sd < np.inf):
@@ -148,38 +148,3 @@ def _checked_block(block: MultivariateNormal) -> Numbers:
     if factor is None or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
         raise ValueError(f"the covariance in the prior of {these} must be symmetric and positive definite")
     return np.asarray(size[:, None] * factor)
-
-
-@dataclass(frozen=True)
-class PriorPredictive:
-    """What torque a prior expects, against the measured one."""
-
-    ratio: tuple[float, float, float]
-    """Root mean square of the torque that the prior expects over that of the measured one: 5, 50 and 95 % of draws.
-    NaN where all is flat. Far from one on both sides of it, the prior and the recording contradict each other."""
-    flat: tuple[str, ...]
-    """Parameters about which the prior says nothing, and that took no part."""
-
-
-def prior_predictive(
-    prior: Prior,
-    W: Num[AnyArray, "S *n p"],
-    torque: Num[AnyArray, "S *n"],
-    draws: int = 1000,
-    seed: int = 0,
-) -> PriorPredictive:
-    """The size of the torque that the proper part of a prior implies for a recorded motion.
-
-    **Arguments:** `W` (S, p) or (S, n, p) for the first p parameters of the prior; the measured torque (S,) or (S, n).
-    """
-    W = np.asarray(W, float)
-    p = W.shape[-1]
-    flat = tuple(name for name, proper in zip(prior.names, prior.proper, strict=True) if not proper)
-    known = np.flatnonzero(prior.proper[:p])
-    if not len(known):
-        return PriorPredictive((np.nan, np.nan, np.nan), flat)
-    x = prior.draws(draws, np.random.default_rng(seed))[:, known]
-    R = np.linalg.qr(W.reshape(-1, p)[:, known], mode="r")
-    size = np.linalg.norm(x @ R.T, axis=1) / np.linalg.norm(torque)
-    low, middle, high = (float(q) for q in np.quantile(size, [0.05, 0.5, 0.95]))
-    return PriorPredictive((low, middle, high), flat)

@@ -419,7 +419,13 @@ def noise_of_rows(job: Job, recording: Recording, filters: Filters) -> Array | N
 
 
 def column_noise(model: Model, recording: Recording, job: Job, filters: Filters) -> NDArray[np.float64]:
-    """(p,) root mean square that noise of the motion leaves in each column: the pipeline, run on noise as well.
+    """(p,) root mean square of `noisy_columns`."""
+    difference = noisy_columns(model, recording, job, filters)
+    return np.asarray(np.sqrt((difference.reshape(-1, len(model.names)) ** 2).mean(axis=0)))
+
+
+def noisy_columns(model: Model, recording: Recording, job: Job, filters: Filters) -> NDArray[np.float64]:
+    """(N, *n, p) what noise of the motion leaves in each column: the pipeline, run with noise as well.
 
     The columns that jump (the sign of the velocity) are left out: the jumps say nothing of the joint's excitation.
     """
@@ -437,6 +443,5 @@ def column_noise(model: Model, recording: Recording, job: Job, filters: Filters)
     rate = recording.sample_rate
     plain = np.asarray(filtered(model, filters, rate, q, torque, (velocity, acceleration))[0])
     noisy = np.asarray(filtered(model, filters, rate, with_noise(q), torque, noisy_motion)[0])
-    difference = (noisy - plain).reshape(-1, len(model.names))
     smooth = np.array(["sign" not in column for column in model.columns])
-    return np.where(smooth, np.sqrt((difference**2).mean(axis=0)), 0.0)
+    return np.where(smooth, noisy - plain, 0.0)
