@@ -40,7 +40,7 @@ def condition_bound(model: Model, harmonics: int, period: float) -> tuple[float,
 
 def _linear_part(model: Model) -> NDArray[np.float64] | None:
     """(p, 4) coefficients of ddq, dq, q and 1 in every column, or None where a column is not made of them."""
-    if model.n_joints != 1:
+    if model.n_joints != 1 or model.sample_rate is not None:
         return None
 
     def row(z: Any) -> Any:

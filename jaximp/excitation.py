@@ -168,7 +168,8 @@ class Design:
         """
         count = FINER * max(200, PER_CYCLE * np.shape(self.trajectory.sine)[-1])
         motion = self.sampled(count / self.period)
-        rows = self.model.observation_matrix(*(motion[name] for name in ("position", "velocity", "acceleration")))
+        q, dq, ddq = (motion[name] for name in ("position", "velocity", "acceleration"))
+        rows = self.model.over_period(q, dq, ddq, count / self.period)
         products = np.einsum("tni,tnj->tij", *[np.asarray(rows).reshape(count, self.model.n_joints, -1)] * 2)
         n = min(count, max(1, round(length / self.period * count)))
         values = np.linalg.eigvalsh(_sliding_sums(products, n))
@@ -184,7 +185,8 @@ class Design:
         q, dq, ddq = (np.asarray(x) for x in self.trajectory(time))
         found = {"time": time, "position": q, "velocity": dq, "acceleration": ddq}
         if self.parameters is not None:
-            found["torque"] = np.asarray((self.moved or self.model).torque(self.parameters, q, dq, ddq))
+            rows = np.asarray((self.moved or self.model).over_period(q, dq, ddq, sample_rate))
+            found["torque"] = rows @ np.asarray(self.parameters)
         return found
 
 
@@ -502,22 +504,23 @@ def _root(excess: Callable[[Array], Array], at_zero: Array, at_one: Array) -> Ar
 def _torque_share(problem: _Problem, series: FourierSeries, t: Array, smooth: Array | None) -> Array:
     """(n,) largest torque as a share of its limit."""
     assert problem.parameters is not None
-    torque = _rows(problem.moved, series(t), smooth) @ problem.parameters
+    torque = _rows(problem.moved, series(t), smooth, problem.period) @ problem.parameters
     return jnp.abs(torque).max(axis=0) / problem.most[-1]
 
 
 # What a motion is worth.
 
 
-def _rows(model: Model, motion: tuple[Array, ...], smooth: Array | None) -> Array:
+def _rows(model: Model, motion: tuple[Array, ...], smooth: Array | None, period: float) -> Array:
     """(N, n, p) regressor; dry friction changes sign within a share `smooth` of the largest velocity."""
     (q, dq, ddq), one_joint = motion, model.n_joints == 1
+    rate = len(q) / period
     if smooth is not None:
         width = jnp.maximum(smooth * jnp.abs(dq).max(axis=0), jnp.finfo(dq.dtype).eps)  # at rest it would vanish
         model = model.smoothed(width[0] if one_joint else width)
     if one_joint:
-        return model.observation_matrix(q[:, 0], dq[:, 0], ddq[:, 0])[:, None]
-    return model.observation_matrix(q, dq, ddq)
+        return model.over_period(q[:, 0], dq[:, 0], ddq[:, 0], rate)[:, None]
+    return model.over_period(q, dq, ddq, rate)
 
 
 def _measured(encoder: Encoder, series: FourierSeries, t: Array) -> tuple[Array, ...]:
@@ -546,7 +549,7 @@ def _grams(
     if problem.encoder is not None:
         t = jnp.arange(round(problem.samples)) / problem.encoder.sample_rate
         motion = _measured(problem.encoder, series, t)
-    rows = _rows(problem.model, motion, smooth) * problem.scale
+    rows = _rows(problem.model, motion, smooth, problem.period) * problem.scale
     products = jnp.einsum("tni,tnj->tij", rows, rows) * (problem.samples / len(t))
     if problem.window is None or whole:
         return products.sum(axis=0)[None]

@@ -267,7 +267,7 @@ def test_the_encoder_is_in_the_loop() -> None:
     t = np.arange(1000) / 100
     series = FourierSeries(*(np.atleast_2d(x) for x in (design.trajectory.sine, design.trajectory.cosine)),
                            np.atleast_1d(design.trajectory.offset), 10.0)  # fmt: skip
-    rows = excitation._rows(HUMAN, excitation._measured(encoder, series, jnp.asarray(t)), None)[:, 0]
+    rows = excitation._rows(HUMAN, excitation._measured(encoder, series, jnp.asarray(t)), None, 10.0)[:, 0]
     assert design.value == pytest.approx(float(np.linalg.svd(rows, compute_uv=False)[-1]), rel=1e-6)
 
 

@@ -97,6 +97,8 @@ class Model(eqx.Module):
 
         **Arguments:** `sample_rate` [Hz] of the period's samples, which need not be that of the recordings.
         """
+        if not self.memory:
+            return self.observation_matrix(q, dq, ddq)
         model, n = self.sampled_at(sample_rate), len(jnp.asarray(q))
         periods = 1 + -(-model.memory // n)
         motion = (jnp.concatenate([jnp.asarray(x)] * periods) for x in (q, dq, ddq))
