@@ -1,4 +1,4 @@
-"""The command line: `jaximp demo | check | identify | design | simulate | reproduce`."""
+"""The command line: `jaximp demo | check | identify | posterior | design | simulate | reproduce`."""
 
 from __future__ import annotations
 
@@ -107,6 +107,30 @@ def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
     job = read_job(job_file)
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
         _identify_into(job, folder)
+    _say_where(out)
+
+
+@app.command()
+def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
+    """Draw from the posterior of the parameters: of a whole recording and of its windows, or of an arm's impedance.
+
+    Writes the draws as NetCDF for ArviZ, summary.json, report.html and the figures into the folder.
+    """
+    from jaximp.inference import infer, infer_trials
+    from jaximp.job import read_job
+    from jaximp.outputs import new_folder
+    from jaximp.posterior_report import write_arm_posterior, write_posterior_results
+
+    job = read_job(job_file)
+    with new_folder(out, force, inputs=[job_file, *job.files()]) as folder, _progress("sampling") as progress:
+        if job.trials is None:
+            content = write_posterior_results(folder, infer(job, lambda share: progress(0.9 * share)), job)
+        else:
+            content = write_arm_posterior(folder, *infer_trials(job, lambda share: progress(0.9 * share)), job)
+    for line in content["sentences"]:
+        typer.echo(line)
+    if content["why"]:
+        typer.echo(f"not to be trusted: {content['why']}")
     _say_where(out)
 
 

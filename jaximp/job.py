@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from jaximp.design_files import read_trajectory
 from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
 from jaximp.payload import METHODS
+from jaximp.priors import LogNormal, Normal
 from jaximp.recordings import recording_from_mapping
 from jaximp.settings import check_keys, checked, optional, read, settings
 from jaximp.trajectories import FourierSeries
@@ -157,6 +158,19 @@ class ModelSettings:
 
 
 @dataclass(frozen=True)
+class PosteriorSettings:
+    """`[posterior]`: what posteriors are drawn with."""
+
+    seed: int = 0
+    ess: float = 1000.0
+    """Effective samples of every parameter."""
+    heavy_tails: bool = False
+    """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
+    prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)
+    """Of parameters by name: `{ mean = 60, sd = 20 }`, or `{ median = 0.7, factor = 2 }` of one that is positive."""
+
+
+@dataclass(frozen=True)
 class Job:
     """Everything that `identify` needs to know."""
 
@@ -172,6 +186,7 @@ class Job:
     """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
     design: str | None = None
     """The trajectory.json of the design that the motion followed: it serves in place of both."""
+    posterior: PosteriorSettings = field(default_factory=PosteriorSettings)
     folder: Path = Path()
     """Where relative file names start."""
     trials: TrialsSettings | None = None
@@ -240,7 +255,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
     known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period", "design"]
-    check_keys(tables, [*known, "trials"], "the job")
+    check_keys(tables, [*known, "posterior", "trials"], "the job")
     if "trials" in tables:
         return _job_of_trials(tables, folder, text)
     for required in ("recording", "model", "window"):
@@ -258,6 +273,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
         trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
         reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
         design=checked(tables.get("design"), str | None, "design"),
+        posterior=posterior_settings(tables.get("posterior", {})),
         folder=folder,
         text=text,
     )
@@ -268,7 +284,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
 def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
     """A job whose trials stand in place of a recording, its filters and its windows."""
     for other in tables:
-        if other not in ("trials", "model", "trust"):
+        if other not in ("trials", "model", "trust", "posterior"):
             raise ValueError(
                 f"[trials] stand in place of a recording and have a window of their own: leave out '{other}'"
             )
@@ -283,7 +299,27 @@ def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
     trust = settings(TrustLimits, tables.get("trust", {}), "trust")
     _check_limits(trust)
     window = WindowSettings(trials.window)
-    return Job({}, ModelSettings(hand_arm=arm), window, trust=trust, trials=trials, folder=folder, text=text)
+    posterior = posterior_settings(tables.get("posterior", {}))
+    if posterior.prior:
+        raise ValueError("[posterior.prior] is for jobs with a recording: an arm's impedance has none")
+    model_of_arm = ModelSettings(hand_arm=arm)
+    return Job({}, model_of_arm, window, trust=trust, posterior=posterior, trials=trials, folder=folder, text=text)
+
+
+def posterior_settings(table: Any) -> PosteriorSettings:
+    """`[posterior]`, with every key and value checked."""
+    if not isinstance(table, dict) or not isinstance(table.get("prior", {}), dict):
+        raise ValueError("[posterior] and [posterior.prior] must be tables")
+    check_keys(table, list(PosteriorSettings.__dataclass_fields__), "[posterior]")
+    prior: dict[str, Normal | LogNormal] = {}
+    for name, one in table.get("prior", {}).items():
+        where = f"posterior.prior.{name}"
+        log_normal = isinstance(one, dict) and "median" in one
+        prior[name] = settings(LogNormal, one, where) if log_normal else settings(Normal, one, where)
+    plain = settings(PosteriorSettings, {key: value for key, value in table.items() if key != "prior"}, "posterior")
+    if not (400 <= plain.ess <= 1e6):
+        raise ValueError(f"posterior.ess is {plain.ess:g}: ask for 400 to 1e6 effective samples")
+    return replace(plain, prior=prior)
 
 
 def model_settings(table: Any) -> ModelSettings:

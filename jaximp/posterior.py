@@ -154,6 +154,14 @@ def make_posterior(
     )
 
 
+def stacked(posteriors: Sequence[Posterior]) -> PosteriorMany:
+    """Posteriors of the same parameters, with as many draws each, as those of windows."""
+    first = posteriors[0]
+    fields = [name for name in Posterior.__dataclass_fields__ if name not in SHARED]
+    arrays = {name: np.stack([np.asarray(getattr(one, name)) for one in posteriors]) for name in fields}
+    return PosteriorMany(**arrays, names=first.names, units=first.units, sampler=first.sampler)
+
+
 def derive(
     posterior: Posterior,
     function: Callable[[Float[Array, " p"]], Float[Array, " k"]],

@@ -16,9 +16,10 @@ PACKAGE = Path(__file__).parents[1] / "jaximp"
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("cli",),
     ("studies",),
-    ("report", "impedance_report", "check"),
+    ("report", "impedance_report", "posterior_report", "check"),
     ("pages",),
     ("plots",),
+    ("inference",),
     ("identify", "impedance"),
     ("trials", "perturbations", "isolation"),
     ("regression",),

@@ -18,7 +18,7 @@ from jaximp.plots.estimates import (
     window_lengths,
 )
 from jaximp.plots.impedance import deviations, impedance_methods, impedance_windows, jerk_spectra, joint_torques
-from jaximp.plots.posterior import bands, corner, ellipse_bands
+from jaximp.plots.posterior import bands, corner, ellipse_bands, torque_bands
 from jaximp.plots.style import Panel, curves, main_parameter, number, png, pretty_unit, with_unit, words
 
 __all__ = [
@@ -45,6 +45,7 @@ __all__ = [
     "reflex_weights",
     "residual_spectrum",
     "torque",
+    "torque_bands",
     "window_lengths",
     "with_unit",
     "words",

@@ -171,6 +171,19 @@ def bands(
 
 
 @styled
+def torque_bands(time: Numbers, torque: Numbers, bands: Numbers) -> Figure:
+    """A torque (N,) over time [s], and quantiles (5, N) of what a posterior predicts: 2.5, 25, 50, 75 and 97.5 %."""
+    figure = Figure(figsize=(WIDTH, 2.6))
+    panel = figure.subplots()
+    draw_band(panel, time, bands[0], bands[-1], color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
+    draw_line(panel, time, bands[len(bands) // 2], color=BLUE, label="predicted")
+    draw_line(panel, time, torque, color=BLACK, linewidth=0.8, label="measured")
+    panel.set(xlabel="time [s]", ylabel="torque [N m]", xlim=(time[0], time[-1]))
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+@styled
 def ellipse_bands(matrices: Mapping[str, Mapping[str, AnyArray]], units: Mapping[str, str] | None = None) -> Figure:
     """Ellipses of stiffness, damping, ... with bands that hold 50 and 95 % of the draws in every direction.
 

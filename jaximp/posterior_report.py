@@ -1,0 +1,144 @@
+"""Posteriors of a job on disk: draws as NetCDF, a summary, figures, and one HTML report that says it all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximp import plots
+from jaximp.impedance import ArmImpedance
+from jaximp.inference import Inference, sentences
+from jaximp.job import Job
+from jaximp.likelihood import stiffness_matrices
+from jaximp.pages import inline, template, versions, without_nan, write_figures, write_summary
+from jaximp.posterior import Posterior, summarise
+from jaximp.posterior_files import save_posterior
+from jaximp.trust import TRUSTED
+from jaximp.types import Numbers
+
+TITLES = {
+    "bands": "Parameters over time",
+    "torque": "Torque that the posterior predicts",
+    "ellipses": "Stiffness and damping of the joints",
+    "corner": "All parameters, two by two",
+}
+CAPTIONS = {
+    "bands": "Median, and bands that hold 50 and 95 %, of windows that share no samples; each has a posterior of its own.",
+    "torque": "The filtered torque, and the band that should hold 95 % of it, by the posterior of the whole record. "
+    "Where the torque leaves it for long, the model lacks something, or a parameter has changed.",
+    "ellipses": "Bands that hold 50 and 95 % of the draws in every direction.",
+    "corner": "Of every pair the regions of highest density that hold 50 and 95 %. Narrow slanting ones: the data tell "
+    "a combination of the two, and neither well.",
+}
+"""Figures in the order of the report, and how to read them."""
+CORNER = 9
+"""Parameters that are shown two by two, at most."""
+
+
+def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> dict[str, Any]:
+    """Write `posterior.nc` (whole record), `windows.nc`, `summary.json`, `report.html` and the figures.
+
+    **Returns:** the summary.
+    """
+    folder, whole = Path(folder), found.whole
+    shown = [name for name in whole.names if not name.startswith("log_noise")]
+    save_posterior(folder / "posterior.nc", whole)
+    figures = {"corner": plots.corner(whole, whole.names[:CORNER]), "torque": _torque(found)}
+    if found.windows is not None:
+        save_posterior(folder / "windows.nc", found.windows, found.end)
+        if found.windows.ok.any():
+            figures["bands"] = plots.bands(found.end, found.windows, shown)
+    content = _content(job, whole, "the whole record", shown, _remarks(found), found.why)
+    content["changes"] = [
+        {"parameter": one.parameter, "from_s": found.end[one.windows[0]], "to_s": found.end[one.windows[1]],
+         "probability": one.probability, "error": one.error}
+        for one in found.changes
+    ]  # fmt: skip
+    content["held_out_log_score"] = None if found.score is None else list(found.score)
+    content["share_of_torque_in_95_percent_band"] = found.inside
+    content["windows"] = _windows(found)
+    return _write(folder, content, figures)
+
+
+def write_arm_posterior(folder: str | Path, found: ArmImpedance, posterior: Posterior, job: Job) -> dict[str, Any]:
+    """The same for an arm's damping and stiffness from perturbed movements."""
+    folder = Path(folder)
+    save_posterior(folder / "posterior.nc", posterior)
+    D, K = stiffness_matrices(posterior.samples)
+    ellipses = {"stiffness": {"arm": K}, "damping": {"arm": D}}
+    units = {"stiffness": "N m/rad", "damping": "N m s/rad"}
+    figures = {"corner": plots.corner(posterior), "ellipses": plots.ellipse_bands(ellipses, units)}
+    why = posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
+    of = f"the impedance of {found.trials} perturbed movements"
+    content = _content(job, posterior, of, list(posterior.names), [*found.warnings, *found.notes], why)
+    return _write(folder, content | {"changes": []}, figures)
+
+
+def _content(
+    job: Job, posterior: Posterior, of: str, shown: Sequence[str], remarks: Sequence[str], why: str
+) -> dict[str, Any]:
+    return {
+        "name": ", ".join(path.name for path in job.files()[:1]),
+        "of": of,
+        "sampler": posterior.sampler,
+        "why": why,
+        "heading": "These draws cannot be trusted."
+        if posterior.why
+        else "What is behind these draws cannot be trusted.",
+        "parameters": summarise(posterior),
+        "sentences": sentences(posterior, shown),
+        "remarks": list(remarks),
+        "versions": versions(),
+        "job": job.text,
+    }
+
+
+def _remarks(found: Inference) -> list[str]:
+    """What a reader must know of the noise, the prior and the bands."""
+    remarks = []
+    orders = [len(one) for one in found.noise.autoregression]
+    if any(orders):
+        remarks.append(
+            "the residuals are not the white noise that the filters were given: an autoregression of order "
+            f"{', '.join(map(str, orders))} stands for what is left, which may also be something that the model lacks"
+        )
+    for k, test in enumerate(found.whiteness):
+        if test.p < 0.01:
+            remarks.append(
+                f"the residuals of output {k + 1} are still not white (Ljung-Box p = {test.p:.1g}): intervals may be "
+                "too narrow"
+            )
+    remarks.append(f"{100 * found.inside:.3g} % of the torque lie within the band that should hold 95 %")
+    low, middle, high = found.prior.ratio
+    if np.isfinite(middle) and (high < 0.1 or low > 10):
+        remarks.append(
+            f"the prior expects {low:.2g} to {high:.2g} times the torque that was measured: they contradict each other"
+        )
+    return [*remarks, *(f"no posterior of the window at {line}" for line in found.left_out), *found.notes]
+
+
+def _windows(found: Inference) -> list[dict[str, Any]]:
+    if found.windows is None:
+        return []
+    return [
+        {"start_s": found.start[k], "end_s": found.end[k], "why": one.why, "parameters": summarise(one)}
+        for k, one in enumerate(found.windows)
+    ]
+
+
+def _torque(found: Inference) -> Any:
+    first: Numbers = found.bands[:, :, 0]
+    return plots.torque_bands(found.time, found.torque[:, 0], first)
+
+
+def _write(folder: Path, content: dict[str, Any], figures: dict[str, Any]) -> dict[str, Any]:
+    content = without_nan(content)
+    images = {name: plots.png(figure) for name, figure in figures.items()}
+    write_figures(folder, images)
+    write_summary(folder, content)
+    page = template("posterior.jinja").render(content=content, titles=TITLES, figures=inline(images, CAPTIONS))
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    return content
