@@ -26,7 +26,7 @@ TITLES = {
     "corner": "All parameters, two by two",
 }
 CAPTIONS = {
-    "bands": "Median, and bands that hold 50 and 95 %, of windows that share no samples; each has a posterior of its own.",
+    "bands": "Median, and bands that hold 50 and 95 %, of windows that share no samples, each by itself.",
     "torque": "The filtered torque, and the band that should hold 95 % of it, by the posterior of the whole record. "
     "Where the torque leaves it for long, the model lacks something, or a parameter has changed.",
     "ellipses": "Bands that hold 50 and 95 % of the draws in every direction.",
@@ -85,9 +85,7 @@ def _content(
         "of": of,
         "sampler": posterior.sampler,
         "why": why,
-        "heading": "These draws cannot be trusted."
-        if posterior.why
-        else "What is behind these draws cannot be trusted.",
+        "heading": f"{'These draws' if posterior.why else 'What is behind these draws'} cannot be trusted.",
         "parameters": summarise(posterior),
         "sentences": sentences(posterior, shown),
         "remarks": list(remarks),
