@@ -84,7 +84,8 @@ class ReflexSettings:
     last: float = 0.49
     """Longest lag [s], by which the reflex should have ended."""
     count: int = 31
-    """How many; closer than half a period of `filter.decimation_cutoff` they cannot be told apart."""
+    """How many. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart; twice as far
+    apart they miss what is between, and every estimate is biased."""
     direction: int = 1
     """1 where a velocity above zero stretches the muscle, else -1."""
 

@@ -146,9 +146,10 @@ def undisturbed(recording: Recording, filters: Filters, ends: bool = True, memor
     A gap that is short against the filters is bridged: the straight line across it is as good as a measurement. What a
     gap, a jump or the beginning spoils, a model with a `memory` of so many samples remembers.
     """
-    known = ~signals.long_gaps(recording.valid, filters.bridge)
+    missing = signals.long_gaps(recording.valid, filters.bridge)
+    known = signals.lengthen_gaps(~missing, memory)
     known[: memory if ends else 0] = False
-    valid = signals.widen_gaps(signals.lengthen_gaps(known, memory), filters.reach, ends)
+    valid = signals.widen_gaps(known, filters.reach, ends)
     jumps = jumped(recording)
     if not jumps.any():
         return valid
