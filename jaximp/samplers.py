@@ -46,22 +46,25 @@ FIRST_CHECK, CHECK_GROWTH, BLOCK = 300, 1.3, 100
 """Steps before the first check, growth from check to check, and steps between two reports of progress."""
 SAVE_EVERY = 30.0
 """Seconds after which the chain's file is written again, whatever the checks say."""
+RUNAWAY = 1e6
+"""Walkers spread wider than this many times the start's standard deviations find no end: sampling stops."""
 FLAT = 1e-12
 """Share of the largest curvature, in units of each parameter's own, below which a direction is flat."""
 
 CHAINS = 4
 """Of every window, each adapting a step size of its own."""
-LANES = 256
+LANES = 128
 """So many windows go together: few enough for their numbers to stay in the cache."""
-WARM_UP, ACCEPT = 150, 0.8
-"""Steps that adapt the step size, and the acceptance that it aims at."""
-LEAPS, LONGEST_STEP, JITTER = 4, 0.45, 0.2
-"""Of a trajectory. Four steps of 0.45 standard deviations turn a normal distribution by more than a quarter: longer
-ones come back. Lengths vary by a fifth to either side, so that no period is met."""
-SHARE = 0.45
-"""Draws of each of the four chains, for every effective sample that is asked for: 1.8 draws for each."""
-ROUNDS, THIN = 4, 4
-"""A window that lacks effective samples is drawn again, every THIN times as many steps as before for one draw."""
+WARM_UP, ACCEPT = 150, 0.95
+"""Steps that adapt the step size, and the acceptance that it aims at; larger steps do not enter curved tails."""
+LEAPS, LONGEST_STEP, JITTER = 4, 0.45, (0.3, 1.2)
+"""Steps of a trajectory, the longest of them in standard deviations, and what they are multiplied by at random. About a
+quarter of a normal distribution's period: longer ones come back, and none meets a period or sticks in a tail."""
+SHARE = 0.6
+"""Draws of each of the four chains, for every effective sample that is asked for: 2.4 draws for each."""
+ROUNDS, THIN, LONGER = 4, 4, 2
+"""A window that lacks effective samples is drawn again, three times at most, with so many times the trajectories for
+each draw that is kept, each of so many times the steps."""
 
 
 def sample_posterior(
@@ -275,6 +278,10 @@ class _Run:
         finally:
             self.save()
 
+    def has_run_away(self) -> bool:
+        width = self.chain.last[0].std(axis=0) / np.sqrt(np.diag(self.chain.spread))
+        return bool(width.max() > RUNAWAY)
+
     def save(self) -> None:
         if self.path is not None and len(self.chain) > self.saved:
             write_chain(self.path, self.chain)
@@ -287,7 +294,9 @@ def _about(centre: Numbers, spread: Numbers) -> Callable[[Numbers, Any], tuple[N
     inverse, p = np.linalg.inv(factor), len(centre)
 
     def log_t(x: Numbers) -> Numbers:
-        return -(TAIL_DOF + p) / 2 * np.log1p((((x - centre) @ inverse.T) ** 2).sum(axis=1) / TAIL_DOF)
+        # Far from the centre squares overflow, and the proposal is as improbable as can be.
+        with np.errstate(over="ignore"):
+            return -(TAIL_DOF + p) / 2 * np.log1p((((x - centre) @ inverse.T) ** 2).sum(axis=1) / TAIL_DOF)
 
     def propose(places: Numbers, random: Any) -> tuple[Numbers, Numbers]:
         normal = random.standard_normal(places.shape)
@@ -311,7 +320,7 @@ def _until_enough(
     while True:
         run.to(check, report)
         result, share = _judge(run.chain, check, ess, names, units)
-        if share >= 1 or check >= max_steps:
+        if share >= 1 or check >= max_steps or run.has_run_away():
             progress(1.0)
             return result
         most = max(most, share)
@@ -407,8 +416,8 @@ def sample_many(
     """Draw from the posteriors of M windows, each of its own, by Hamiltonian Monte Carlo (blackjax).
 
     Four chains for each window, in units of the covariance given, so that no matrix is factorised within compiled code;
-    each chain adapts its own step size. Windows that lack effective samples go on in units of the covariance of their
-    own draws, with four times as many steps for each draw that is kept, three times at most.
+    each chain adapts its own step size. Windows that lack effective samples are drawn again in units of the covariance
+    of their own draws, with four trajectories twice as long for each draw that is kept; and so on, three times at most.
 
     **Arguments:** `log_densities` one log density whose arrays have a leading axis of windows; `starts` inside the
     support, such as the modes; `covariances` there; `ess` the effective samples that every parameter should have, of
@@ -438,7 +447,9 @@ def sample_many(
         if not len(todo):
             break
         share = partial(_shared, report, attempt)
-        found = windows.draw(todo, starts, factors, jax.random.fold_in(key, attempt), THIN**attempt, share)
+        found = windows.draw(
+            todo, starts, factors, jax.random.fold_in(key, attempt), (LEAPS * LONGER**attempt, THIN**attempt), share
+        )
         for name, values in found.items():
             drawn[name][todo] = values
         lacking = np.minimum(drawn["ess"], drawn["ess_tail"])[todo].min(axis=1) < max(ess, ESS_LEAST)
@@ -504,14 +515,14 @@ class _Windows:
         starts: Numbers,
         factors: Numbers,
         key: PRNGKeyArray,
-        thin: int,
+        effort: tuple[int, int],
         report: Progress,
     ) -> dict[str, Numbers]:
         """Draws of these windows with their diagnostics; a window's random numbers do not depend on the others."""
         parts, batches = [], self.batches(windows)
         for k, batch in enumerate(batches):
             keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.asarray(batch))
-            found = _hamiltonian(self.of(batch), starts[batch], factors[batch], keys, thin, self.rest, self.draws)
+            found = _hamiltonian(self.of(batch), starts[batch], factors[batch], keys, *effort, self.rest, self.draws)
             parts.append([np.asarray(x) for x in found])
             report((k + 1) / len(batches))
         chains, density, acceptance = (np.concatenate(x)[: len(windows)] for x in zip(*parts, strict=True))
@@ -530,9 +541,9 @@ def _own_values(arrays: Any, rest: Any, places: Array) -> Array:
     return jax.vmap(lambda one, place: eqx.combine(one, rest)(place))(arrays, places)
 
 
-@partial(jax.jit, static_argnums=(5, 6))
+@partial(jax.jit, static_argnums=(6, 7))
 def _hamiltonian(
-    arrays: Any, centres: Array, factors: Array, keys: Array, thin: Array, rest: Any, draws: int
+    arrays: Any, centres: Array, factors: Array, keys: Array, leaps: Array, thin: Array, rest: Any, draws: int
 ) -> tuple[Array, Array, Array]:
     """(B, C, N, p) draws, (B, C, N) their log densities, and (B, C) acceptance."""
 
@@ -546,7 +557,7 @@ def _hamiltonian(
             value = density(place(z))
             return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
-        chain = partial(_chain, log_density, len(centre), thin, draws)
+        chain = partial(_chain, log_density, len(centre), leaps, thin, draws)
         z, values, acceptance = jax.vmap(chain)(jax.random.split(key, CHAINS))
         return jax.vmap(jax.vmap(place))(z), values, acceptance
 
@@ -554,7 +565,7 @@ def _hamiltonian(
 
 
 def _chain(
-    log_density: Callable[[Array], Array], p: int, thin: Array, draws: int, key: Array
+    log_density: Callable[[Array], Array], p: int, leaps: Array, thin: Array, draws: int, key: Array
 ) -> tuple[Array, Array, Array]:
     """One chain from the standard normal distribution, nearer to zero where there is no density."""
     import blackjax
@@ -565,8 +576,8 @@ def _chain(
 
     def step(key: Array, state: Any, size: Array) -> tuple[Any, Array]:
         jitter_key, key = jax.random.split(key)
-        size *= jax.random.uniform(jitter_key, minval=1 - JITTER, maxval=1 + JITTER)
-        state, info = kernel(key, state, log_density, size, jnp.ones(p), LEAPS)
+        size *= jax.random.uniform(jitter_key, minval=JITTER[0], maxval=JITTER[1])
+        state, info = kernel(key, state, log_density, size, jnp.ones(p), leaps)
         return state, jnp.nan_to_num(info.acceptance_rate)
 
     def warm(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], None]:

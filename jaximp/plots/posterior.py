@@ -18,12 +18,14 @@ BANDS = (0.95, 0.5)
 """Probability within each shade, the palest first."""
 SHADES = (0.22, 0.35)
 """Opacity of each shade; they lie on top of each other."""
-CELLS = 60
-"""Of a two-dimensional histogram, along each parameter."""
-SMOOTH = 1.4
+CELLS = 48
+"""Of a histogram, along each parameter."""
+SMOOTH = 1.6
 """Cells: standard deviation of what smooths the histogram, so that contours are lines and not islands."""
-SPAN = 0.001
-"""Share of the draws left out at either end of an axis."""
+SPAN, MARGIN = 0.002, 0.15
+"""Share of the draws left out at either end of an axis, and how much wider than the others it then is."""
+SMALL = 5
+"""From so many parameters on the letters are smaller."""
 RAYS = 181
 """Directions in which ellipses are held against each other."""
 
@@ -43,13 +45,11 @@ def corner(
     """
     names = list(names or posterior.names)
     columns = [index_of(posterior.names, name) for name in names]
-    draws = posterior.samples[:, columns]
-    limits = np.quantile(draws, [SPAN, 1 - SPAN], axis=0)
-    second = None
+    shown = [posterior.samples[:, columns]]
     if other is not None:
-        second = other.samples[:, [index_of(other.names, name) for name in names]]
-        ends = np.quantile(second, [SPAN, 1 - SPAN], axis=0)
-        limits = np.stack([np.minimum(limits[0], ends[0]), np.maximum(limits[1], ends[1])])
+        shown.append(other.samples[:, [index_of(other.names, name) for name in names]])
+    limits = np.stack([_limits(draws) for draws in shown])
+    limits = np.stack([limits[:, 0].min(axis=0), limits[:, 1].max(axis=0)])
     n = len(names)
     figure = Figure(figsize=(WIDTH, WIDTH if n > 2 else WIDTH * 0.7))
     panels = figure.subplots(n, n, squeeze=False)
@@ -60,39 +60,45 @@ def corner(
                 panel.remove()
                 continue
             panel.grid(False)
-            if i == j:
-                _marginal(panel, draws[:, i], limits[:, i], filled=True)
-                if second is not None:
-                    _marginal(panel, second[:, i], limits[:, i], filled=False)
-            else:
-                _region(panel, draws[:, [j, i]], limits[:, [j, i]], filled=True)
-                if second is not None:
-                    _region(panel, second[:, [j, i]], limits[:, [j, i]], filled=False)
+            for k, draws in enumerate(shown):
+                if i == j:
+                    _marginal(panel, draws[:, i], filled=k == 0)
+                else:
+                    _region(panel, draws[:, [j, i]], filled=k == 0)
+            panel.set(xlim=tuple(limits[:, j]), ylim=(0, 1.08) if i == j else tuple(limits[:, i]))
             _truths(panel, truth or {}, names[j], names[i] if i != j else None)
-            _ticks(panel, [posterior.names[columns[k]] for k in (j, i)], [posterior.units[columns[k]] for k in (j, i)])
+            _label(panel, [f"{words(names[k])}\n[{pretty_unit(posterior.units[columns[k]])}]" for k in (j, i)], n)
             _outer_only(panel, i, j, n)
     figure.align_labels()
     return figure
 
 
-def _marginal(panel: Axes, x: Numbers, limits: Numbers, filled: bool) -> None:
-    edges = np.linspace(limits[0], limits[1], CELLS + 1)
+def _limits(draws: Numbers) -> Numbers:
+    """(2, k) lower and upper ends of the axes of k parameters."""
+    low, high = np.quantile(draws, [SPAN, 1 - SPAN], axis=0)
+    margin = np.where(high > low, MARGIN * (high - low), 1e-12 + MARGIN * np.abs(high))
+    return np.stack([low - margin, high + margin])
+
+
+def _marginal(panel: Axes, x: Numbers, filled: bool) -> None:
+    low, high = _limits(x)
+    edges = np.linspace(low, high, CELLS + 1)
     density = gaussian_filter(np.histogram(x, edges)[0].astype(float), SMOOTH, mode="nearest")
-    middle = (edges[1:] + edges[:-1]) / 2
+    middle, height = (edges[1:] + edges[:-1]) / 2, density / density.max()
     if not filled:
-        panel.plot(middle, density / density.max(), color=VERMILLION, linewidth=1.0, linestyle="--")
+        panel.plot(middle, height, color=VERMILLION, linewidth=1.0, linestyle="--")
         return
     for share, shade in zip(BANDS, SHADES, strict=True):
-        low, high = np.quantile(x, [0.5 - share / 2, 0.5 + share / 2])
-        within = (middle >= low) & (middle <= high)
-        panel.fill_between(middle[within], density[within] / density.max(), color=BLUE, alpha=shade, linewidth=0)
-    panel.plot(middle, density / density.max(), color=BLUE, linewidth=1.0)
-    panel.set(xlim=tuple(limits), ylim=(0, 1.08))
+        ends = np.quantile(x, [0.5 - share / 2, 0.5 + share / 2])
+        within = np.linspace(ends[0], ends[1], 99)
+        panel.fill_between(within, np.interp(within, middle, height), color=BLUE, alpha=shade, linewidth=0)
+    panel.plot(middle, height, color=BLUE, linewidth=1.0)
 
 
-def _region(panel: Axes, xy: Numbers, limits: Numbers, filled: bool) -> None:
+def _region(panel: Axes, xy: Numbers, filled: bool) -> None:
     """Contours of a smoothed histogram, at the heights above which lie 50 and 95 % of the draws."""
-    edges = [np.linspace(limits[0, k], limits[1, k], CELLS + 1) for k in (0, 1)]
+    low, high = _limits(xy)
+    edges = [np.linspace(low[k], high[k], CELLS + 1) for k in (0, 1)]
     density = gaussian_filter(np.histogram2d(xy[:, 0], xy[:, 1], bins=edges)[0], SMOOTH, mode="nearest").T
     x, y = ((edge[1:] + edge[:-1]) / 2 for edge in edges)
     falling = np.sort(density, axis=None)[::-1]
@@ -106,7 +112,6 @@ def _region(panel: Axes, xy: Numbers, limits: Numbers, filled: bool) -> None:
         panel.contour(x, y, density, levels, colors=[BLUE], linewidths=0.8)
     else:
         panel.contour(x, y, density, levels, colors=[VERMILLION], linewidths=0.9, linestyles="--")
-    panel.set(xlim=tuple(limits[:, 0]), ylim=tuple(limits[:, 1]))
 
 
 def _truths(panel: Axes, truth: Mapping[str, float], x: str, y: str | None) -> None:
@@ -116,12 +121,14 @@ def _truths(panel: Axes, truth: Mapping[str, float], x: str, y: str | None) -> N
         panel.axhline(truth[y], color=BLACK, linewidth=0.8)
 
 
-def _ticks(panel: Axes, names: Sequence[str], units: Sequence[str]) -> None:
-    """Three numbers at most, slanted, and names as short as they are."""
+def _label(panel: Axes, labels: Sequence[str], n: int) -> None:
+    """Three numbers at most, slanted."""
     panel.locator_params(nbins=3)
     panel.tick_params(axis="x", rotation=40)
-    labels = [f"{words(name)}\n[{pretty_unit(unit)}]" for name, unit in zip(names, units, strict=True)]
-    panel.set(xlabel=labels[0], ylabel=labels[1])
+    panel.set_xlabel(labels[0], fontsize=6 if n >= SMALL else None)
+    panel.set_ylabel(labels[1], fontsize=6 if n >= SMALL else None)
+    if n >= SMALL:
+        panel.tick_params(labelsize=6.5)
 
 
 def _outer_only(panel: Axes, i: int, j: int, n: int) -> None:
