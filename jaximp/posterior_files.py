@@ -210,7 +210,7 @@ def to_inference_data(posterior: Posterior | PosteriorMany, windows: AnyArray | 
         "sample_stats": xr.Dataset(stats, coords, about),
     }
     arviz = _arviz()
-    if hasattr(arviz, "InferenceData"):
+    if "InferenceData" in vars(arviz):  # from version 1 on asking for it makes a warning
         return arviz.InferenceData(**groups)
     return xr.DataTree.from_dict(groups)
 

@@ -203,7 +203,9 @@ def test_diagnostics_are_those_of_arviz(chains: int, draws: int) -> None:
     x[..., 5] = x[..., 5].round(1)  # ties, as rejected proposals make them
     mine = diagnose(x)
     data = arviz.convert_to_dataset({"x": x})
-    for got, there in zip(mine, (arviz.ess(data), arviz.ess(data, method="tail"), arviz.rhat(data)), strict=True):
+    for got, there in zip(
+        mine, (arviz.ess(data), arviz.ess(data, method="tail", prob=(0.05, 0.95)), arviz.rhat(data)), strict=True
+    ):
         values = there["x"].values if "x" in there else there["posterior"]["x"].values
         np.testing.assert_allclose(got, values, rtol=1e-9)
 
