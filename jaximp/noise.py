@@ -49,7 +49,8 @@ class Noise:
     autocovariance: Numbers = field(default_factory=lambda: PLAIN)
     """(L,) by lag, in rows, as `signals.autocovariance` makes it of the filters; a single one if the rows are white."""
     autoregression: tuple[Numbers, ...] = ()
-    """For each output the coefficients (k,) by which white rows still follow from those before; none if they do not."""
+    """For each output the coefficients (k,) by which the rows that the filters made of it followed from those before:
+    what went through the filters was not white. None if it was."""
 
     def __post_init__(self) -> None:
         r = np.asarray(self.autocovariance, float)
@@ -66,6 +67,19 @@ class Noise:
         density = _density(self.autocovariance)
         edge = np.flatnonzero(density >= NEGLIGIBLE * density.max())[-1]
         return max(1, (len(density) - 1) // max(1, int(edge)))
+
+    def of_output(self, k: int) -> tuple[Numbers, float]:
+        """Autocovariance by lag of the noise in the rows that are kept, lag zero one, and the ridge."""
+        r = self.autocovariance[:: self.every]
+        ridge = RIDGE * float(_density(r).max())
+        if not self.autoregression or not len(self.autoregression[k]):
+            return r, ridge
+        polynomial = np.r_[1, -self.autoregression[k]]
+        slowest = min(0.9999, np.abs(np.roots(polynomial)).max())
+        density = _density(r, len(r) + int(np.ceil(-25 / np.log(slowest))))
+        whole = np.fft.irfft(density / np.abs(np.fft.rfft(polynomial, 2 * (len(density) - 1))) ** 2)
+        whole = whole[: len(whole) // 2]
+        return whole[: np.flatnonzero(np.abs(whole) > 1e-10 * whole[0])[-1] + 1] / whole[0], ridge / whole[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +142,9 @@ def whiten(
     columns = np.where(valid[..., None], np.concatenate([W, y[..., None]], axis=-1), 0)
     if not np.isfinite(columns).all():
         raise ValueError("rows of W or y are not finite: mark them with valid=False, or mend them")
-    valid, count, lags = valid.copy(), np.zeros(y.shape[1]), tuple(noise.autocovariance[:: noise.every])
+    count = np.zeros(y.shape[1])
     for k, output in enumerate(columns.swapaxes(0, 1)):
-        count[k] = _whitened_in_place(output, valid[:, k], lags)
-        if noise.autoregression:
-            count[k] -= _predicted_in_place(output, valid[:, k], noise.autoregression[k])
+        count[k] = _whitened_in_place(output, valid[:, k], *noise.of_output(k))
     return WhiteRows(columns[..., :-1], columns[..., -1], valid, count)
 
 
@@ -208,27 +220,25 @@ def fit_autoregression(residual: Num[AnyArray, " R"], valid: Shaped[AnyArray, " 
     """(k,) coefficients by which residuals follow from those before; none where `whiteness` is not refuted.
 
     Refuted is what white noise would do in less than `SIGNIFICANCE` of all records. The order is then the one, up to
-    10 log10(R), with the smallest information criterion of Schwarz; the coefficients are those of least squares over
-    the rows that have valid rows before them.
+    10 log10(R), with the smallest information criterion of Schwarz.
+
+    **Source:** Burg 1975, whose coefficients are always those of a stable process; pairs of valid rows count.
     """
-    e = np.asarray(residual, float)
-    valid = np.ones(len(e), bool) if valid is None else np.asarray(valid, bool)
-    test = whiteness(e, valid)
-    if not test.p < SIGNIFICANCE:
+    counts = np.ones(len(residual)) if valid is None else np.asarray(valid, float)
+    forward = np.where(counts > 0, np.asarray(residual, float), 0)
+    n, backward, polynomial, power = counts.sum(), forward.copy(), np.ones(1), 1.0
+    if not whiteness(forward, counts).p < SIGNIFICANCE:
         return np.zeros(0)
-    most = int(10 * np.log10(valid.sum()))
-    past, complete = _past(e, most), _history(valid, most)
-    if complete.sum() <= 2 * most:
-        return np.zeros(0)
-
-    def lost(k: int) -> float:
-        rows = past[complete, :k]
-        left = e[complete] - rows @ np.linalg.lstsq(rows, e[complete])[0] if k else e[complete]
-        return float(complete.sum() * np.log(left @ left) + k * np.log(complete.sum()))
-
-    order = int(np.argmin([lost(k) for k in range(most + 1)]))
-    enough = _history(valid, order)
-    return np.asarray(np.linalg.lstsq(past[enough, :order], e[enough])[0]) if order else np.zeros(0)
+    orders = [(0.0, polynomial)]
+    for _ in range(int(min(10 * np.log10(n), n // 3))):
+        forward, backward, counts = forward[1:], backward[:-1], counts[1:] * counts[:-1]
+        f, b = forward * counts, backward * counts
+        reflection = -2 * (f @ b) / (f @ f + b @ b)
+        forward, backward = forward + reflection * backward, backward + reflection * forward
+        polynomial = np.r_[polynomial, 0] + reflection * np.r_[0, polynomial[::-1]]
+        power *= 1 - reflection**2
+        orders.append((n * np.log(power) + (len(polynomial) - 1) * np.log(n), polynomial))
+    return -min(orders, key=lambda order: order[0])[1][1:]
 
 
 def whitened_covariance(
@@ -262,34 +272,36 @@ def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArra
 
 
 def corrected(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"]) -> Numbers:
-    """(n, p + 1, p + 1) rows that stand for those of a regressor without its noise.
+    """(n, p + 1, p + 1) triangles' worth of rows that stand for those of a regressor without its noise.
 
-    Their Gram matrix is `W'W - S Sigma`, so that the bias is gone, and what they leave of the torque at the optimum is
-    what is left there in truth: the torque's noise and that of the regressor, of variance s^2 + theta' Sigma theta,
-    the square of the density's noise. Right up to terms of second order in Sigma.
+    Their optimum is that of the Gram matrix `M = W'W - S Sigma`, free of the bias. What they leave of the torque there
+    is what is left in truth, the noise of the torque and of the regressor, of variance v = s^2 + theta' Sigma theta:
+    the square of the density's noise. Their own Gram matrix is v times the inverse of the covariance
+    `inv(M) (v M + S (v Sigma + Sigma theta theta' Sigma)) inv(M)`.
 
     **Raises:** ValueError where the noise is as large as the motion.
 
-    **Source:** Fuller 1987, section 2.2; Nakamura 1990 for the corrected likelihood.
+    **Source:** Fuller 1987, section 2.2.
     """
     n, p = len(rows.count), rows.W.shape[-1]
     out = np.zeros((n, p + 1, p + 1))
     for k, (sigma, count) in enumerate(zip(_covariances(column_noise, n, p), rows.count, strict=True)):
-        W, y = rows.W[:, k], rows.y[:, k]
-        size = np.linalg.norm(W, axis=0)
+        size = np.linalg.norm(rows.W[:, k], axis=0)
         size = np.where(size > 0, size, 1)
-        values, vectors = np.linalg.eigh((W / size).T @ (W / size) - count * sigma / np.outer(size, size))
-        if values[0] < -1e-12:
+        W, y, error = rows.W[:, k] / size, rows.y[:, k], count * sigma / np.outer(size, size)
+        M = W.T @ W - error
+        if np.linalg.eigvalsh(M)[0] < -1e-12:
             raise ValueError(
                 "the noise of the motion is as large as the motion in some direction of the regressor: excite more, or "
                 "lower filter.position_cutoff"
             )
-        known = values > 1e-12  # what this output does not depend on is zero
-        root = np.sqrt(np.where(known, values, 0))
-        along = np.where(known, vectors.T @ (W / size).T @ y / np.where(known, root, 1), 0)
-        theta = vectors @ np.where(known, along / np.where(known, root, 1), 0) / size
-        out[k, :p, :p], out[k, :p, p] = root[:, None] * vectors.T * size, along
-        out[k, p, p] = np.linalg.norm(y - W @ theta)
+        theta = np.linalg.pinv(M, hermitian=True) @ W.T @ y  # an output need not depend on every parameter
+        left = y - W @ theta
+        lost = error @ theta
+        spread = M + error + np.outer(lost, lost) / (left @ left)
+        values, vectors = np.linalg.eigh(M @ np.linalg.pinv(spread, hermitian=True) @ M)
+        root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+        out[k, :p, :p], out[k, :p, p], out[k, p, p] = root * size, root @ theta, np.linalg.norm(left)
     return out
 
 
@@ -308,44 +320,24 @@ def _covariances(column_noise: AnyArray, n: int, p: int) -> Numbers:
     return np.broadcast_to(np.diag(given**2) if given.ndim == 1 else given, (n, p, p))
 
 
-def _past(x: Numbers, order: int) -> Numbers:
-    """(R, order) the rows before each row, the last first; zero before the start."""
-    return np.stack([np.r_[np.zeros(k), x[:-k]] for k in range(1, order + 1)], axis=1) if order else x[:, None][:, :0]
-
-
-def _history(valid: np.ndarray, order: int) -> np.ndarray:
-    """(R,) rows that are valid, and so many before them too."""
-    return np.asarray(valid & (_past(valid.astype(float), order) > 0).all(axis=1))
-
-
-def _predicted_in_place(columns: Numbers, valid: np.ndarray, coefficients: Numbers) -> int:
-    """Take off the columns what follows from the rows before; returns how many rows lack those and no longer count."""
-    complete = _history(valid, len(coefficients))
-    columns -= np.stack([_past(column, len(coefficients)) @ coefficients for column in columns.T], axis=1)
-    columns[~complete] = 0
-    lost = int((valid & ~complete).sum())
-    valid[:] = complete
-    return lost
-
-
-def _whitened_in_place(columns: Numbers, valid: np.ndarray, lags: tuple[float, ...]) -> float:
+def _whitened_in_place(columns: Numbers, valid: np.ndarray, lags: Numbers, ridge: float) -> float:
     """Whiten the valid rows (R, k); returns how many independent ones there are."""
     from scipy.linalg.lapack import dtbtrs
 
     if len(lags) == 1 or not valid.any():
         return float(valid.sum())
-    factor, count = _band_factor(lags, valid.tobytes())
+    factor, count = _band_factor(lags.tobytes(), ridge, valid.tobytes())
     columns[valid] = dtbtrs(factor, columns[valid], uplo="L")[0]
     return count
 
 
 @lru_cache(maxsize=8)
-def _band_factor(lags: tuple[float, ...], valid: bytes) -> tuple[Numbers, float]:
+def _band_factor(lags: bytes, ridge: float, valid: bytes) -> tuple[Numbers, float]:
     """Cholesky factor of the covariance of the valid rows, as a band, and how many independent rows they make."""
     from scipy.linalg import cholesky_banded
 
-    place, r = np.flatnonzero(np.frombuffer(valid, bool)), np.asarray(lags)
-    n, bands = len(place), min(len(lags), len(place))
+    place, r = np.flatnonzero(np.frombuffer(valid, bool)), np.frombuffer(lags)
+    n, bands = len(place), min(len(r), len(place))
     if n * bands > LARGEST_BAND:
         raise ValueError(
             f"the noise of {n} rows has a memory of {bands} rows, too much to whiten: a low-pass before (fewer rows), "
@@ -355,19 +347,14 @@ def _band_factor(lags: tuple[float, ...], valid: bytes) -> tuple[Numbers, float]
     for k in range(bands):
         apart = place[k:] - place[: n - k]
         band[k, : n - k] = np.where(apart < len(r), r[np.minimum(apart, len(r) - 1)], 0)
-    ridge = RIDGE * float(_density(r).max())
-
-    def factor(times: float) -> Numbers:
-        raised = band.copy()
-        raised[0] += times * ridge
-        return np.asarray(cholesky_banded(raised, overwrite_ab=True, lower=True, check_finite=False))
-
-    # sum of ridge/(lambda + ridge) is the slope of the log determinant along the logarithm of the ridge
-    up, down = (2 * np.log(factor(times)[0]).sum() for times in (1.1, 1 / 1.1))
-    return factor(1.0), n - float(up - down) / (2 * np.log(1.1))
+    band[0] += ridge
+    density = _density(r)
+    # The eigenvalues of a long stretch are as many values of the density (Szegő 1915).
+    count = n * float(np.mean(density / (density + ridge)))
+    return np.asarray(cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)), count
 
 
-def _density(r: Numbers) -> Numbers:
-    """Spectral density of an autocovariance, from frequency zero to half a cycle per row."""
-    n = 1 << max(8, int(np.ceil(np.log2(8 * len(r)))))
+def _density(r: Numbers, memory: int = 0) -> Numbers:
+    """Spectral density of an autocovariance, from frequency zero to half a cycle per row, fine enough for `memory`."""
+    n = 1 << max(8, int(np.ceil(np.log2(8 * max(len(r), memory)))))
     return np.asarray(2 * np.fft.rfft(r, n).real - r[0])

@@ -74,7 +74,7 @@ class Prior(eqx.Module):
         x = np.full((n, len(self.names)), np.nan)
         root = np.asarray(self.root)[np.ix_(proper, proper)]
         x[:, proper] = np.asarray(self.mean)[proper] + np.linalg.solve(root, generator.normal(size=(len(proper), n))).T
-        return np.where(self.logarithmic, np.exp(x), x)
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0)), x)
 
 
 def make_prior(
