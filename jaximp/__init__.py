@@ -4,11 +4,14 @@ from jaximp import models
 from jaximp.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.identify import Estimates, identify, identify_recording
 from jaximp.impedance import ArmImpedance, identify_impedance, identify_trials
+from jaximp.inference import Inference, compare_models, infer, infer_recording, infer_trials
 from jaximp.isolation import KnownArm
 from jaximp.job import FilterSettings, Job, parse_job, read_job
 from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
+from jaximp.likelihood import adjusted, estimate_density, linear_density, stiffness_density, window_densities
 from jaximp.movement_trials import judge_sensors, read_movements, read_postures
 from jaximp.movements import Handle, Movements
+from jaximp.noise import Noise, fit_noise, joined, whiten
 from jaximp.perturbations import Perturbations, design_perturbations
 from jaximp.posterior import (
     ExactPosterior,
@@ -20,6 +23,7 @@ from jaximp.posterior import (
     summarise,
 )
 from jaximp.posterior_files import load_posterior, save_posterior, to_inference_data
+from jaximp.priors import LogNormal, MultivariateNormal, Normal, make_prior
 from jaximp.recordings import (
     load_recording,
     load_trial_table,
@@ -54,12 +58,17 @@ __all__ = [
     "FilterSettings",
     "FourierSeries",
     "Handle",
+    "Inference",
     "Job",
     "KnownArm",
     "Limits",
     "LinearFit",
+    "LogNormal",
     "MinimumJerk",
     "Movements",
+    "MultivariateNormal",
+    "Noise",
+    "Normal",
     "Perturbations",
     "Posterior",
     "PosteriorMany",
@@ -72,13 +81,17 @@ __all__ = [
     "TrustLimits",
     "WindowFit",
     "adaptive_least_squares",
+    "adjusted",
     "at_rest",
+    "compare_models",
     "confidence",
     "confidence_interval",
     "derive",
     "design_excitation",
     "design_perturbations",
+    "estimate_density",
     "exact_posterior",
+    "fit_noise",
     "fit_stiffness",
     "fit_stiffness_linear",
     "fit_trials",
@@ -88,14 +101,20 @@ __all__ = [
     "identify_impedance",
     "identify_recording",
     "identify_trials",
+    "infer",
+    "infer_recording",
+    "infer_trials",
     "jerk",
+    "joined",
     "joint_trials",
     "judge_sensors",
     "least_squares",
+    "linear_density",
     "load_posterior",
     "load_recording",
     "load_trial_table",
     "load_trials",
+    "make_prior",
     "merge_triangles",
     "models",
     "parse_job",
@@ -117,6 +136,9 @@ __all__ = [
     "sliding_least_squares",
     "sliding_pieces",
     "sliding_theta",
+    "stiffness_density",
     "summarise",
     "to_inference_data",
+    "whiten",
+    "window_densities",
 ]

@@ -1,39 +1,51 @@
 """Posteriors of a job: of its whole record, and of windows that share no sample with each other.
 
 A model of one output whose noise is Gaussian and whose prior is flat has an exact posterior; others are sampled. The
-noise is what the filters make of white noise, with an autoregression where the residuals demand one.
+noise is what the filters make of white noise, with an autoregression where the residuals demand one; noise of the
+position is corrected for where it matters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from jaximp.identify import Prepared, prepare
+from jaximp.identify import Prepared, in_windows, prepare
 from jaximp.impedance import ArmImpedance, identify_trials
 from jaximp.job import Job
-from jaximp.likelihood import estimate_density, linear_density, noise_names, window_densities
+from jaximp.likelihood import Density, estimate_density, linear_density, noise_names, window_densities
 from jaximp.models import Model
-from jaximp.noise import Noise, Whiteness, WhiteRows, fit_noise, optimum, residuals, whiten, whiteness
+from jaximp.noise import (
+    Noise,
+    Whiteness,
+    WhiteRows,
+    attenuation,
+    fit_noise,
+    optimum,
+    residuals,
+    triangles,
+    whiten,
+    whitened_covariance,
+    whiteness,
+)
 from jaximp.posterior import Posterior, PosteriorMany, derive, exact_posterior, probability_greater, stacked
-from jaximp.predictive import PriorPredictive, log_score, prior_predictive, torque_bands
+from jaximp.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.priors import MultivariateNormal, Prior, make_prior
-from jaximp.regression import windows_in_rows
+from jaximp.regression import Placement, noisy_columns, windows_in_rows
 from jaximp.samplers import sample_many, sample_posterior
 from jaximp.signals import require_float64
-from jaximp.types import Numbers, Progress, Recording
+from jaximp.trust import Verdicts
+from jaximp.types import AnyArray, Numbers, Progress, Recording
 
 CONTRADICTION = 1e-3
 """Windows whose parameters differ more than this is probable contradict each other."""
-REACH = 2000
-"""Rows after which an autoregression has forgotten."""
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Of the bands of torque."""
 
@@ -61,15 +73,19 @@ class Inference:
     """(M,) of each of them [s]."""
     end: Numbers
     """(M,) [s]"""
+    verdicts: Verdicts
+    """(M,) of `identify` on them: what their model explains, and how their motion excites it."""
     left_out: tuple[str, ...]
     """Why other windows have none."""
     changes: tuple[Change, ...]
     noise: Noise
     whiteness: tuple[Whiteness, ...]
     """Of the whitened residuals of each output."""
-    score: tuple[float, float] | None
-    """Mean log predictive density of the second half of the record from the first, per independent row, and its
-    standard error; None where it was not tried."""
+    bias: Numbers
+    """(p,) of least squares by noise of the position, in standard errors; draws are free of it beyond 0.25."""
+    held_out: Numbers | None
+    """(R, n) log predictive density of the second half of the record from the first, row by row, NaN where it does not
+    count; None where the first half alone determines nothing."""
     prior: PriorPredictive
     time: Numbers
     """(N,) [s]"""
@@ -83,12 +99,42 @@ class Inference:
     def why(self) -> str:
         """Why the posterior of the whole record cannot be trusted; empty where it can.
 
-        The windows must not contradict each other: the squares of their differences from the common mean, in standard
-        deviations, are those of chi-squared where nothing changes (Cochran 1954).
+        Some window must be trusted by `identify`, and they must not contradict each other: the squares of their
+        differences from the common mean, in standard deviations, are those of chi-squared where nothing changes
+        (Cochran 1954).
         """
-        if self.whole.why or self.windows is None or self.windows.ok.sum() < 2:
+        if self.whole.why or self.windows is None:
             return self.whole.why
-        samples = self.windows.samples[self.windows.ok]
+        if not self.verdicts.trusted.any():
+            k = len(self.verdicts.reason) // 2
+            return (
+                f"no window can be trusted; that in the middle: {self.verdicts.verdict[k]}, {self.verdicts.reason[k]}"
+            )
+        return self._contradiction()
+
+    @property
+    def good(self) -> np.ndarray:
+        """(M,) windows whose draws and whose verdict can be trusted."""
+        return np.zeros(0, bool) if self.windows is None else self.windows.ok & self.verdicts.trusted
+
+    @property
+    def score(self) -> tuple[float, float] | None:
+        """Mean log predictive density of the second half of the record from the first, per row, and its standard error;
+        to compare models see `compare_models`."""
+        return None if self.held_out is None else mean_score(_counted(self.held_out))
+
+    @property
+    def inside(self) -> float:
+        """Share of the torque within the 95 % band."""
+        counted = np.isfinite(self.torque)
+        within = (self.torque >= self.bands[0]) & (self.torque <= self.bands[-1])
+        return float(within[counted].mean())
+
+    def _contradiction(self) -> str:
+        if self.good.sum() < 2:
+            return ""
+        assert self.windows is not None
+        samples = self.windows.samples[self.good]
         mean, variance = samples.mean(axis=1), samples.var(axis=1)
         common = (mean / variance).sum(axis=0) / (1 / variance).sum(axis=0)
         squares = ((mean - common) ** 2 / variance).sum(axis=0)
@@ -101,13 +147,6 @@ class Inference:
             f"the windows contradict each other in {self.whole.names[worst]} (p = {p[worst]:.1g}): it changes, or the "
             "model lacks something, and the whole record's draws are those of an average; look at the windows"
         )
-
-    @property
-    def inside(self) -> float:
-        """Share of the torque within the 95 % band."""
-        counted = np.isfinite(self.torque)
-        within = (self.torque >= self.bands[0]) & (self.torque <= self.bands[-1])
-        return float(within[counted].mean())
 
 
 def infer(job: Job, progress: Progress = lambda share: None) -> Inference:
@@ -127,34 +166,51 @@ def infer_recording(
     if job.filter.mode != "once":
         raise ValueError("posteriors need filters that run over the recording once: set filter.mode = 'once'")
     prepared = prepare(job, recording, alone)
-    rows, model = prepared.rows, _model(prepared)
-    W, y, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
-    noise = fit_noise(W, y, prepared.noise, valid)
-    prior = _prior(job, prepared, model, 1 if y.ndim == 1 else y.shape[1])
-    white = whiten(W, y, noise, valid)
+    data = _data(job, prepared)
     progress(0.2)
-    whole = _whole(job, model, white, prior)
-    progress(0.6)
-    windows, start, end, left_out = _windows(job, prepared, model, noise, prior)
+    whole = data.posterior()
+    progress(0.5)
+    place, verdicts = _judged(job, prepared)
+    windows, start, left_out = data.windows(place.starts, place.window)
     progress(0.9)
-    left = residuals(white, optimum(white))
-    bands = torque_bands(_of_rows(whole.samples, noise, len(model.names)), W, LEVELS)
-    return Inference(
+    left = residuals(data.white, optimum(data.white))
+    time, y, kept = prepared.rows.time, data.y.reshape(len(data.y), -1), np.isin(place.starts, start)
+    found = Inference(
         whole=whole,
         windows=windows,
-        start=start,
-        end=end,
-        left_out=left_out,
-        changes=_changes(windows, start, end, model),
-        noise=noise,
-        whiteness=tuple(whiteness(left[:, k], white.valid[:, k]) for k in range(left.shape[1])),
-        score=_score(job, model, W, y, valid, noise, prior),
-        prior=prior_predictive(prior, W[valid], y[valid]),
-        time=rows.time,
-        torque=np.where(valid, y, np.nan).reshape(len(y), -1),
-        bands=bands.reshape(len(LEVELS), len(y), -1),
+        start=time[start],
+        end=time[start + place.window - 1],
+        verdicts=Verdicts(verdicts.verdict[kept], verdicts.reason[kept]),
+        left_out=tuple(f"{time[first]:.4g} s: {why}" for first, why in left_out),
+        changes=(),
+        noise=data.noise,
+        whiteness=tuple(whiteness(left[:, k], data.white.valid[:, k]) for k in range(left.shape[1])),
+        bias=data.bias,
+        held_out=data.held_out(),
+        prior=prior_predictive(data.prior, data.W[data.valid], data.y[data.valid]),
+        time=time,
+        torque=np.where(data.valid.reshape(y.shape), y, np.nan),
+        bands=torque_bands(whole.samples, data.W, LEVELS).reshape(len(LEVELS), *y.shape),
         notes=recording.notes,
     )
+    return replace(found, changes=tuple(_changes(found, data.model.names)))
+
+
+def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
+    """By how much the first model predicts the held-out torque better than the second, and its standard error.
+
+    The mean difference of the log predictive density per row, over rows that count for both: of the same recording
+    through the same filters.
+    """
+    if first.held_out is None or second.held_out is None:
+        raise ValueError("half of the record does not determine one of the models: there is no score to compare")
+    if first.held_out.shape != second.held_out.shape:
+        raise ValueError("scores compare between models of the same torque, through the same filters: these are others")
+    return mean_score(_counted(first.held_out - second.held_out))
+
+
+def _counted(scores: Numbers) -> Numbers:
+    return scores[np.isfinite(scores).all(axis=1)].sum(axis=1)
 
 
 def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[ArmImpedance, Posterior]:
@@ -173,9 +229,136 @@ def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[Arm
     return found, derive(drawn, density.elements, density.element_names, density.element_units)
 
 
-def _model(prepared: Prepared) -> Model:
-    """Of the columns of the rows: robot and human stand side by side in those of both."""
-    return prepared.model if prepared.pair is None else prepared.pair.robot + prepared.model
+def sentences(posterior: Posterior, names: Sequence[str]) -> list[str]:
+    """What a paper says of each parameter: median and 95 % credible interval."""
+    lines = []
+    for name in names:
+        low, middle, high = np.quantile(posterior[name], [0.025, 0.5, 0.975])
+        unit = posterior.units[posterior.names.index(name)]
+        lines.append(f"{name} {middle:.4g} {unit} (95 % credible interval {low:.4g} to {high:.4g})")
+    return lines
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Rows of one model, and what is known besides them."""
+
+    job: Job
+    model: Model
+    W: Numbers
+    """(N, *n, p)"""
+    y: Numbers
+    """(N, *n) [N m]"""
+    valid: AnyArray
+    """(N, *n)"""
+    difference: Numbers
+    """(N, *n, p) what noise of the position makes of the columns."""
+    filtered: AnyArray | None
+    """What the filters make of white noise, by lag."""
+    prior: Prior
+
+    @cached_property
+    def noise(self) -> Noise:
+        return fit_noise(self.W, self.y, self.filtered, self.valid)
+
+    @cached_property
+    def white(self) -> WhiteRows:
+        return whiten(self.W, self.y, self.noise, self.valid)
+
+    @cached_property
+    def column_noise(self) -> Numbers:
+        """(n, p, p) covariance of what noise of the position leaves in the whitened columns."""
+        return whitened_covariance(self.difference, self.noise, self.valid)
+
+    @cached_property
+    def bias(self) -> Numbers:
+        return attenuation(self.white, self.column_noise)
+
+    @property
+    def is_exact(self) -> bool:
+        return len(self.white.count) == 1 and not any(self.prior.proper) and not self.job.posterior.heavy_tails
+
+    def within(self, rows: slice) -> _Data:
+        """A part of the record, with noise of its own."""
+        W, y, valid, difference = (x[rows] for x in (self.W, self.y, self.valid, self.difference))
+        return replace(self, W=W, y=y, valid=valid, difference=difference)
+
+    def posterior(self) -> Posterior:
+        """Of all rows."""
+        if self.is_exact:
+            return self._exact(self.white, jax.random.key(self.job.posterior.seed))
+        density = self._density(self.white)
+        return sample_posterior(density, ess=self.job.posterior.ess, seed=self.job.posterior.seed)
+
+    def _exact(self, rows: WhiteRows, key: jax.Array) -> Posterior:
+        given, names, units = triangles(rows, self.column_noise)[0], self.model.names, self.model.units
+        exact = exact_posterior(given, float(rows.count[0]), names, units)
+        return exact.posterior(key, round(4 * self.job.posterior.ess))
+
+    def _density(self, rows: WhiteRows) -> Density:
+        heavy = self.job.posterior.heavy_tails
+        column_noise = None if heavy else self.column_noise
+        names, units = self.model.names, self.model.units
+        return linear_density(names, units, rows, self.prior, heavy_tails=heavy, column_noise=column_noise)
+
+    def windows(self, starts: AnyArray, length: int) -> tuple[PosteriorMany | None, AnyArray, list[tuple[int, str]]]:
+        """Posteriors of windows, the first row of each, and why others have none."""
+        parts = [slice(first, first + length) for first in starts]
+        white = [whiten(self.W[part], self.y[part], self.noise, self.valid[part]) for part in parts]
+        drawn, reasons = self._exact_windows(white) if self.is_exact else self._sampled_windows(white)
+        without = [(int(first), why) for first, why in zip(starts, reasons, strict=True) if why]
+        kept = np.array([first for first, why in zip(starts, reasons, strict=True) if not why], int)
+        return drawn, kept, without
+
+    def _exact_windows(self, parts: Sequence[WhiteRows]) -> tuple[PosteriorMany | None, list[str]]:
+        key, drawn, reasons = jax.random.key(self.job.posterior.seed + 1), [], [""] * len(parts)
+        for k, rows in enumerate(parts):
+            try:
+                drawn.append(self._exact(rows, jax.random.fold_in(key, k)))
+            except ValueError as error:
+                reasons[k] = str(error)
+        return (stacked(drawn) if drawn else None), reasons
+
+    def _sampled_windows(self, parts: Sequence[WhiteRows]) -> tuple[PosteriorMany | None, list[str]]:
+        settings = self.job.posterior
+        column_noise = None if settings.heavy_tails else self.column_noise
+        key = jax.random.key(settings.seed + 1)
+        try:
+            densities, reasons = window_densities(
+                self.model.names, self.model.units, parts, self.prior,
+                heavy_tails=settings.heavy_tails, column_noise=column_noise,
+            )  # fmt: skip
+            starts, covariances = (np.asarray(x) for x in _laplace(densities))
+            return sample_many(densities, starts, covariances, key, ess=settings.ess), list(reasons)
+        except ValueError as error:
+            return None, [str(error)] * len(parts)
+
+    def held_out(self) -> Numbers | None:
+        """Scores of the second half by the first, of which alone the noise is known as well."""
+        half = len(self.y) // 2
+        first, second = self.within(slice(half)), self.within(slice(half, None))
+        try:
+            samples = first.posterior().samples
+        except ValueError:
+            return None
+        rows = whiten(second.W, second.y, first.noise, second.valid)
+        heavy = self.job.posterior.heavy_tails
+        return np.where(rows.valid, log_scores(samples, rows, heavy_tails=heavy), np.nan)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def _laplace(density: Density) -> tuple[jax.Array, jax.Array]:
+    return density.laplace()
+
+
+def _data(job: Job, prepared: Prepared) -> _Data:
+    """Rows and prior of a job; robot and human stand side by side in those of both."""
+    model = prepared.model if prepared.pair is None else prepared.pair.robot + prepared.model
+    W, y, valid = (np.asarray(x) for x in (prepared.rows.W, prepared.rows.torque, prepared.rows.valid))
+    difference = noisy_columns(model, prepared.recording, job, prepared.filters)
+    prior = _prior(job, prepared, model, 1 if y.ndim == 1 else y.shape[1])
+    return _Data(job, model, W, y, valid, difference, prepared.noise, prior)
 
 
 def _prior(job: Job, prepared: Prepared, model: Model, outputs: int) -> Prior:
@@ -188,99 +371,20 @@ def _prior(job: Job, prepared: Prepared, model: Model, outputs: int) -> Prior:
     return make_prior((*model.names, *noise_names(outputs)), job.posterior.prior, blocks)
 
 
-def _is_exact(job: Job, prior: Prior, outputs: int) -> bool:
-    return outputs == 1 and not any(prior.proper) and not job.posterior.heavy_tails
+def _judged(job: Job, prepared: Prepared) -> tuple[Placement, Verdicts]:
+    """Windows one behind the other, and what `identify` says of each."""
+    job = replace(job, window=replace(job.window, step=job.window.length))
+    place = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters)
+    return place, in_windows(job, prepared)[0].verdicts
 
 
-def _whole(job: Job, model: Model, white: WhiteRows, prior: Prior) -> Posterior:
-    """Exact where it can be; else by emcee."""
-    settings = job.posterior
-    density = linear_density(model.names, model.units, white, prior, heavy_tails=settings.heavy_tails)
-    if not _is_exact(job, prior, len(white.count)):
-        return sample_posterior(density, ess=settings.ess, seed=settings.seed)
-    exact = exact_posterior(white.triangles()[0], float(white.count[0]), model.names, model.units)
-    return exact.posterior(jax.random.key(settings.seed), round(4 * settings.ess))
-
-
-def _windows(
-    job: Job, prepared: Prepared, model: Model, noise: Noise, prior: Prior
-) -> tuple[PosteriorMany | None, Numbers, Numbers, tuple[str, ...]]:
-    """Posteriors of windows one behind the other, where each begins and ends, and why others have none."""
-    rows = prepared.rows
-    W, y, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
-    length = windows_in_rows(job, prepared.recording, rows, prepared.filters).window
-    starts = np.arange(0, len(y) - length + 1, length)
-    settings, found, reasons = job.posterior, [], []
-    key = jax.random.key(settings.seed + 1)
-    outputs = 1 if y.ndim == 1 else y.shape[1]
-    if _is_exact(job, prior, outputs):
-        for k, first in enumerate(starts):
-            cut = slice(first, first + length)
-            try:
-                white = whiten(W[cut], y[cut], noise, valid[cut])
-                exact = exact_posterior(white.triangles()[0], float(white.count[0]), model.names, model.units)
-            except ValueError as error:
-                reasons.append(str(error))
-                continue
-            reasons.append("")
-            found.append(exact.posterior(jax.random.fold_in(key, k), round(4 * settings.ess)))
-        windows = stacked(found) if found else None
-    else:
-        densities, why = window_densities(model.names, model.units, W, y, starts, length, noise, valid, prior)
-        modes, covariances = eqx.filter_vmap(lambda density: density.laplace())(densities)
-        windows = sample_many(densities, np.asarray(modes), np.asarray(covariances), key, ess=settings.ess)
-        reasons = list(why)
-    usable = starts[[not why for why in reasons]]
-    if windows is not None:
-        usable_reasons = iter(windows.why)
-        reasons = [why or next(usable_reasons) for why in reasons]
-    left_out = tuple(f"{rows.time[first]:.4g} s: {why}" for first, why in zip(starts, reasons, strict=True) if why)
-    return windows, rows.time[usable], rows.time[usable + length - 1], left_out
-
-
-def _of_rows(samples: Numbers, noise: Noise, p: int) -> Numbers:
-    """Samples whose noise is that of a row, where an autoregression makes it larger than what is new in it."""
-    samples = samples.copy()
-    for k, coefficients in enumerate(noise.autoregression):
-        answer = lfilter([1.0], [1.0, *-np.asarray(coefficients)], np.eye(1, REACH)[0])
-        samples[:, p + k] += np.log(answer @ answer) / 2
-    return samples
-
-
-def _changes(windows: PosteriorMany | None, start: Numbers, end: Numbers, model: Model) -> tuple[Change, ...]:
+def _changes(found: Inference, names: Sequence[str]) -> Iterator[Change]:
     """Of every parameter, from each window that can be trusted to the next."""
+    windows, start, end = found.windows, found.start, found.end
     if windows is None:
-        return ()
-    good = [int(k) for k in np.flatnonzero(windows.ok)]
-    changes = []
-    for before, after in pairwise(good):
+        return
+    for before, after in pairwise(int(k) for k in np.flatnonzero(found.good)):
         spans = ((start[after], end[after]), (start[before], end[before]))
-        for name in model.names:
-            found = probability_greater(windows[after], windows[before], name, spans=spans)
-            changes.append(Change(name, (before, after), *found))
-    return tuple(changes)
-
-
-def _score(
-    job: Job, model: Model, W: Numbers, y: Numbers, valid: Numbers, noise: Noise, prior: Prior
-) -> tuple[float, float] | None:
-    """How well the first half of the record predicts the second, where that costs nothing."""
-    if not _is_exact(job, prior, 1 if y.ndim == 1 else y.shape[1]):
-        return None
-    half = len(y) // 2
-    try:
-        first, second = (whiten(W[part], y[part], noise, valid[part]) for part in (slice(half), slice(half, None)))
-        exact = exact_posterior(first.triangles()[0], float(first.count[0]), model.names, model.units)
-    except ValueError:
-        return None
-    return log_score(np.asarray(exact.samples(jax.random.key(job.posterior.seed), 2000)), second)
-
-
-def sentences(posterior: Posterior, names: Sequence[str]) -> list[str]:
-    """What a paper says of each parameter: median and 95 % credible interval."""
-    lines = []
-    for name in names:
-        low, middle, high = np.quantile(posterior[name], [0.025, 0.5, 0.975])
-        unit = posterior.units[posterior.names.index(name)]
-        lines.append(f"{name} {middle:.4g} {unit} (95 % credible interval {low:.4g} to {high:.4g})")
-    return lines
+        for name in names:
+            chance = probability_greater(windows[after], windows[before], name, spans=spans)
+            yield Change(name, (before, after), *chance)

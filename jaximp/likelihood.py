@@ -22,7 +22,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Num, Shaped
 
 from jaximp.definite import back_substitute, cholesky, eigenvalues, triangle
-from jaximp.noise import ATTENUATION, Noise, WhiteRows, attenuation, corrected, whiten
+from jaximp.noise import WhiteRows, triangles
 from jaximp.predictive import NU, student
 from jaximp.priors import Prior, make_prior
 from jaximp.signals import require_float64
@@ -195,58 +195,61 @@ def linear_density(
     """
     require_float64()
     names, n = tuple(names), len(rows.count)
-    given = rows.triangles()
-    if column_noise is not None and (np.abs(attenuation(rows, column_noise)) > ATTENUATION).any():
-        if heavy_tails:
-            raise ValueError("heavy tails and noise in the regressor do not go together: filter the position more")
-        given = corrected(rows, column_noise)
     prior = _prior_for(prior, (*names, *noise_names(n)))
-    why = undetermined(given, rows.count, prior)
+    likelihood, why = _likelihood_of(rows, prior, heavy_tails, column_noise)
     if why:
         raise ValueError(why)
-    likelihood: Any = GaussianRows(given, rows.count)
-    if heavy_tails:
-        nu = NU if heavy_tails is True else float(heavy_tails)
-        if not nu > 0:
-            raise ValueError(f"heavy_tails is {nu:g}: degrees of freedom are above zero")
-        likelihood = HeavyRows(rows.columns(), rows.valid.T, rows.count, np.asarray(nu))
     return _on_device(Density(likelihood, prior, prior.names, (*units, *(f"ln({noise_unit})",) * n)))
 
 
 def window_densities(
     names: Sequence[str],
     units: Sequence[str],
-    W: Num[AnyArray, "N *n p"],
-    y: Num[AnyArray, "N *n"],
-    starts: Num[AnyArray, " M"],
-    window: int,
-    noise: Noise | Num[AnyArray, " L"] | None = None,
-    valid: Shaped[AnyArray, "N *n"] | None = None,
+    parts: Sequence[WhiteRows],
     prior: Prior | None = None,
+    *,
+    heavy_tails: bool | float = False,
+    column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"] | None = None,
 ) -> tuple[Density, tuple[str, ...]]:
-    """Log densities of many windows of `window` rows at once, their arrays with a leading axis, for `eqx.filter_vmap`.
+    """Log densities of many windows at once, their arrays with a leading axis, for `eqx.filter_vmap`.
 
-    **Returns:** the densities of the windows that determine all parameters, and for each of the M why it does not;
+    Arguments as for `linear_density`; `parts` are the rows of the windows, as many in each.
+
+    **Returns:** the densities of the windows that determine all parameters, and for each of them all why it does not;
     empty where it does.
 
     **Raises:** ValueError where none does.
     """
     require_float64()
-    counts = np.ones(np.shape(y), bool) if valid is None else np.asarray(valid, bool)
-    W, y, parts = np.asarray(W), np.asarray(y), []
-    for start in np.asarray(starts, int):
-        cut = slice(start, start + window)
-        parts.append(whiten(W[cut], y[cut], noise, counts[cut]))
     n = len(parts[0].count)
     flat = _prior_for(prior, (*names, *noise_names(n)))
-    triangles = [part.triangles() for part in parts]
-    reasons = tuple(undetermined(*one, flat) for one in zip(triangles, (part.count for part in parts), strict=True))
-    usable = [k for k, why in enumerate(reasons) if not why]
-    if not usable:
+    found, reasons = [], []
+    for rows in parts:
+        try:
+            likelihood, why = _likelihood_of(rows, flat, heavy_tails, column_noise)
+        except ValueError as error:
+            why = str(error)
+        reasons.append(why)
+        found += [] if why else [Density(likelihood, flat, flat.names, (*units, *("ln(N m)",) * n))]
+    if not found:
         raise ValueError(f"no window determines all parameters; the first: {reasons[0]}")
-    likelihood = GaussianRows(np.stack([triangles[k] for k in usable]), np.stack([parts[k].count for k in usable]))
-    prior = jax.tree.map(lambda x: np.broadcast_to(x, (len(usable), *x.shape)), flat)
-    return _on_device(Density(likelihood, prior, flat.names, (*units, *("ln(N m)",) * n))), reasons
+    return _on_device(jax.tree.map(lambda *leaves: np.stack(leaves), *found)), tuple(reasons)
+
+
+def _likelihood_of(
+    rows: WhiteRows, prior: Prior, heavy_tails: bool | float, column_noise: AnyArray | None
+) -> tuple[GaussianRows | HeavyRows, str]:
+    """Of rows with Gaussian noise or heavy tails, and what these and the prior leave undetermined."""
+    given = triangles(rows, column_noise)
+    why = undetermined(given, rows.count, prior)
+    if not heavy_tails:
+        return GaussianRows(given, rows.count), why
+    if not np.array_equal(given, rows.triangles()):
+        raise ValueError("heavy tails and noise in the regressor do not go together: filter the position more")
+    nu = NU if heavy_tails is True else float(heavy_tails)
+    if not nu > 0:
+        raise ValueError(f"heavy_tails is {nu:g}: degrees of freedom are above zero")
+    return HeavyRows(rows.columns(), rows.valid.T, rows.count, np.asarray(nu)), why
 
 
 def stiffness_density(

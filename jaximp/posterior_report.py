@@ -13,6 +13,7 @@ from jaximp.impedance import ArmImpedance
 from jaximp.inference import Inference, sentences
 from jaximp.job import Job
 from jaximp.likelihood import stiffness_matrices
+from jaximp.noise import ATTENUATION
 from jaximp.pages import inline, template, versions, without_nan, write_figures, write_summary
 from jaximp.posterior import Posterior, summarise
 from jaximp.posterior_files import save_posterior
@@ -49,9 +50,9 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     figures = {"corner": plots.corner(whole, whole.names[:CORNER]), "torque": _torque(found)}
     if found.windows is not None:
         save_posterior(folder / "windows.nc", found.windows, found.end)
-        if found.windows.ok.any():
-            figures["bands"] = plots.bands(found.end, found.windows, shown)
-    content = _content(job, whole, "the whole record", shown, _remarks(found), found.why)
+        if found.good.any():
+            figures["bands"] = plots.bands(found.end, found.windows, shown, trusted=found.good)
+    content = _content(job, whole, "the whole record", shown, _remarks(found, job.posterior.heavy_tails), found.why)
     content["changes"] = [
         {"parameter": one.parameter, "from_s": found.end[one.windows[0]], "to_s": found.end[one.windows[1]],
          "probability": one.probability, "error": one.error}
@@ -94,7 +95,7 @@ def _content(
     }
 
 
-def _remarks(found: Inference) -> list[str]:
+def _remarks(found: Inference, heavy_tails: bool) -> list[str]:
     """What a reader must know of the noise, the prior and the bands."""
     remarks = []
     orders = [len(one) for one in found.noise.autoregression]
@@ -110,10 +111,24 @@ def _remarks(found: Inference) -> list[str]:
                 "too narrow"
             )
     remarks.append(f"{100 * found.inside:.3g} % of the torque lie within the band that should hold 95 %")
+    biased = [(name, one) for name, one in zip(found.whole.names, found.bias, strict=False) if abs(one) > ATTENUATION]
+    if biased:
+        name, one = max(biased, key=lambda pair: abs(pair[1]))
+        remarks.append(
+            f"noise of the position biases least squares, {name} most, by {one:.2g} standard errors; "
+            + ("with heavy tails it stays" if heavy_tails else "it is corrected for")
+        )
     low, middle, high = found.prior.ratio
     if np.isfinite(middle) and (high < 0.1 or low > 10):
         remarks.append(
             f"the prior expects {low:.2g} to {high:.2g} times the torque that was measured: they contradict each other"
+        )
+    distrusted = np.flatnonzero(~found.verdicts.trusted)
+    if len(distrusted):
+        k = distrusted[len(distrusted) // 2]
+        remarks.append(
+            f"{len(distrusted)} of {len(found.end)} windows are not to be trusted, whatever their draws say; the one "
+            f"at {found.start[k]:.4g} s: {found.verdicts.verdict[k]}, {found.verdicts.reason[k]}"
         )
     return [*remarks, *(f"no posterior of the window at {line}" for line in found.left_out), *found.notes]
 
@@ -122,7 +137,13 @@ def _windows(found: Inference) -> list[dict[str, Any]]:
     if found.windows is None:
         return []
     return [
-        {"start_s": found.start[k], "end_s": found.end[k], "why": one.why, "parameters": summarise(one)}
+        {
+            "start_s": found.start[k],
+            "end_s": found.end[k],
+            "verdict": found.verdicts.verdict[k],
+            "why": one.why or found.verdicts.reason[k],
+            "parameters": summarise(one),
+        }
         for k, one in enumerate(found.windows)
     ]
 

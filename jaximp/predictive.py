@@ -16,24 +16,35 @@ from jaximp.types import AnyArray, Numbers
 
 NU = 4.0
 """Degrees of freedom of heavy-tailed noise, unless told."""
+BLOCKS = 30
+"""Stretches of time by whose means a mean score is known."""
 
 
 def log_score(
     samples: Num[AnyArray, "draws P"], rows: WhiteRows, *, heavy_tails: bool | float = False
 ) -> tuple[float, float]:
-    """Mean log predictive density per independent row of data that the samples have not seen, and its standard error.
+    """Mean log predictive density per row of data that the samples have not seen, and its standard error.
 
-    For the comparison of models: the larger the better. Only scores of the same torque, whitened with the same noise,
-    compare. A difference of scores is much surer than either; for its own standard error subtract `log_scores` row by
-    row.
+    For the comparison of models: the larger the better. Scores of the same torque through the same filters compare. A
+    difference of scores is much surer than either: `mean_score` of the differences of `log_scores` row by row.
     """
-    scores = log_scores(samples, rows, heavy_tails=heavy_tails)[rows.valid]
-    n = rows.count.sum()
-    return float(scores.sum() / n), float(scores.std() * np.sqrt(len(scores)) / n)
+    return mean_score(log_scores(samples, rows, heavy_tails=heavy_tails)[rows.valid])
+
+
+def mean_score(scores: Num[AnyArray, " R"]) -> tuple[float, float]:
+    """Mean of scores that follow each other in time, and its standard error by the means of `BLOCKS` stretches.
+
+    Neighbouring scores are alike where a model lacks something, and rows by themselves would say too much.
+    """
+    scores = np.asarray(scores, float)
+    means = np.array([part.mean() for part in np.array_split(scores, min(BLOCKS, len(scores)))])
+    return float(scores.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))
 
 
 def log_scores(samples: Num[AnyArray, "draws P"], rows: WhiteRows, *, heavy_tails: bool | float = False) -> Numbers:
     """(R, n) log of the predictive density of every row, given the rows before it; zero where it is not valid.
+
+    It is that of the torque itself, whatever made its noise white, so that models with noise of their own compare.
 
     **Source:** the pointwise predictive density of Gelman, Hwang and Vehtari 2014.
     """
@@ -50,7 +61,7 @@ def log_scores(samples: Num[AnyArray, "draws P"], rows: WhiteRows, *, heavy_tail
             z = (rows.y[part, k, None] - rows.W[part, k] @ samples[:, :p].T) * np.exp(-log_noise)
             one = np.asarray(student(jnp.asarray(z), nu)) if heavy_tails else -(z**2 + np.log(2 * np.pi)) / 2
             out[part, k] = np.logaddexp.reduce(one - log_noise, axis=1) - np.log(len(samples))
-    return np.where(rows.valid, out, 0)
+    return np.where(rows.valid, out - np.log(rows.size), 0)
 
 
 def torque_bands(

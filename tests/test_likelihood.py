@@ -37,6 +37,8 @@ from jaximp.noise import (
     fit_noise,
     joined,
     optimum,
+    residuals,
+    triangles,
     whiten,
     whitened_covariance,
     whiteness,
@@ -254,6 +256,23 @@ def test_heavy_tails_shrug_off_outliers() -> None:
     np.testing.assert_allclose(mode, found.x, rtol=1e-4)
 
 
+def test_long_records_are_whitened_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    r = signals.autocovariance(BAND_PASS, 20)
+    W, y = (np.asarray(signals.filter_zero_phase(BAND_PASS, x))[::20] for x in record(20 * 30 * len(r)))
+    n, valid = len(y), np.ones(len(y), bool)
+    valid[n // 2 : n // 2 + 40] = False
+    pieces = whiten(W, y, r, valid)
+    monkeypatch.setattr("jaximp.noise.PIECE", 10**6)
+    whole = whiten(W, y, r, valid)
+    assert np.abs(pieces.W - whole.W).max() > 0
+    left, same = (residuals(rows, optimum(rows)) for rows in (pieces, whole))
+    stderr = np.linalg.norm(np.linalg.inv(whole.triangles()[0, :3, :3]), axis=1) * same.std()
+    assert (np.abs(optimum(pieces) - optimum(whole)) < 0.01 * stderr).all()
+    np.testing.assert_allclose(left.std(), same.std(), rtol=1e-3)
+    np.testing.assert_allclose(pieces.size, whole.size, rtol=1e-3)
+    np.testing.assert_array_equal(pieces.count, whole.count)
+
+
 def test_trials_together_are_one_record() -> None:
     W, y = record(90)
     parts = [whiten(W[k : k + 30], y[k : k + 30]) for k in (0, 30, 60)]
@@ -269,18 +288,24 @@ def test_many_windows_are_windows_one_by_one() -> None:
     valid = np.ones(300, bool)
     valid[250:255] = False
     starts = np.arange(0, 250, 50)
-    densities, reasons = window_densities(NAMES, UNITS, W, y, starts, 50, r, valid)
+    cuts = [slice(start, start + 50) for start in starts]
+    parts = [whiten(W[cut], y[cut], r, valid[cut]) for cut in cuts]
+    densities, reasons = window_densities(NAMES, UNITS, parts)
     assert [bool(why) for why in reasons] == [False, False, True, False, False]
     assert "stiffness has no effect" in reasons[2]
     at = jnp.asarray([*THETA, -1.0])
     modes, covariances = eqx.filter_jit(eqx.filter_vmap(lambda density: density.laplace()))(densities)
-    values = eqx.filter_vmap(lambda density: density(at))(densities)
-    for k, start in enumerate(np.delete(starts, 2)):
-        cut = slice(start, start + 50)
-        alone = linear_density(NAMES, UNITS, whiten(W[cut], y[cut], r, valid[cut]))
-        np.testing.assert_allclose(values[k], alone(at), rtol=1e-9)
+    heavy, _ = window_densities(NAMES, UNITS, parts, heavy_tails=5.0)
+
+    def values(of: Any) -> Any:
+        return eqx.filter_vmap(lambda density: density(at))(of)
+
+    for k, rows in enumerate(part for part, why in zip(parts, reasons, strict=True) if not why):
+        alone = linear_density(NAMES, UNITS, rows)
+        np.testing.assert_allclose(values(densities)[k], alone(at), rtol=1e-9)
         np.testing.assert_allclose(modes[k], alone.laplace()[0], rtol=1e-6)
         np.testing.assert_allclose(covariances[k], alone.laplace()[1], rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(values(heavy)[k], linear_density(NAMES, UNITS, rows, heavy_tails=5.0)(at), rtol=1e-9)
 
 
 def test_stiffness_density_is_flat_in_the_stiffness() -> None:
@@ -523,6 +548,9 @@ def test_small_noise_in_the_regressor_is_left_alone_and_large_noise_refused() ->
         linear_density(NAMES, UNITS, rows, column_noise=np.full(3, 30.0))
     with pytest.raises(ValueError, match="column_noise has the shape"):
         attenuation(rows, np.ones(2))
+    given = triangles(rows, np.array([0.0, 0.2, 0.03]))
+    assert np.abs(given - rows.triangles()).max() > 1e-3
+    np.testing.assert_array_equal(given, np.triu(given))
     difference = np.random.default_rng(0).normal(size=(5000, 3)) @ np.diag([1.0, 2.0, 3.0])
     np.testing.assert_allclose(whitened_covariance(difference)[0], np.diag([1, 4, 9]), atol=0.5)
 
@@ -541,6 +569,11 @@ def test_score_is_the_log_predictive_density_of_unseen_rows() -> None:
     np.testing.assert_allclose(log_score(samples, rows)[0], expected[5:].mean())
     heavy = np.log(np.mean([student.pdf(y, 4, W @ s[:3], np.exp(s[3])) for s in samples], axis=0))
     np.testing.assert_allclose(log_score(samples, rows, heavy_tails=True)[0], heavy[5:].mean())
+    # Whatever made the noise white: of all rows together it is the density of the torque.
+    r = 0.8 ** np.arange(50)
+    whole = log_scores(samples[:1], whiten(W, y, r)).sum()
+    covariance = np.exp(-2.0) * (toeplitz(np.r_[r, np.zeros(10)]) + 1e-8 * 9 * np.eye(60))
+    np.testing.assert_allclose(whole, multivariate_normal.logpdf(y, W @ THETA, covariance), rtol=1e-6)
     with pytest.raises(ValueError, match="samples have 3 columns"):
         log_score(samples[:, :3], rows)
 

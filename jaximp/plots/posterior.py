@@ -151,13 +151,15 @@ def bands(
     names: Sequence[str] | None = None,
     *,
     truth: Mapping[str, Numbers] | None = None,
+    trusted: AnyArray | None = None,
 ) -> Figure:
     """Parameters over time [s]: medians, with bands that hold 50 and 95 %.
 
-    A window whose draws cannot be trusted is left out. `truth` holds values over the same time, drawn in black.
+    A window whose draws cannot be trusted is left out, and those that are not `trusted` (M,) for what else is known of
+    them. `truth` holds values over the same time, drawn in black.
     """
     names = list(names or posteriors.names)
-    trusted = posteriors.ok
+    trusted = posteriors.ok if trusted is None else posteriors.ok & np.asarray(trusted, bool)
     figure = Figure(figsize=(WIDTH, 1.7 * len(names) + 0.4))
     panels = figure.subplots(len(names), 1, squeeze=False, sharex=True)[:, 0]
     for panel, name in zip(panels, names, strict=True):
