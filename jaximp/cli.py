@@ -127,10 +127,8 @@ def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
             content = write_posterior_results(folder, infer(job, lambda share: progress(0.9 * share)), job)
         else:
             content = write_arm_posterior(folder, *infer_trials(job, lambda share: progress(0.9 * share)), job)
-    for line in content["sentences"]:
+    for line in [f"not to be trusted: {content['why']}"] if content["why"] else content["sentences"]:
         typer.echo(line)
-    if content["why"]:
-        typer.echo(f"not to be trusted: {content['why']}")
     _say_where(out)
 
 

@@ -35,8 +35,8 @@ CAPTIONS = {
     "a combination of the two, and neither well.",
 }
 """Figures in the order of the report, and how to read them."""
-CORNER = 9
-"""Parameters that are shown two by two, at most."""
+CORNER = 12
+"""Parameters that are shown two by two, at most: the last ones, which are the stiffnesses."""
 
 
 def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> dict[str, Any]:
@@ -45,9 +45,10 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     **Returns:** the summary.
     """
     folder, whole = Path(folder), found.whole
-    shown = [name for name in whole.names if not name.startswith("log_noise")]
+    human = [name for name in whole.names if name.startswith("human.")]  # the robot's are those of its own recording
+    shown = human or [name for name in whole.names if not name.startswith("log_noise")]
     save_posterior(folder / "posterior.nc", whole)
-    figures = {"corner": plots.corner(whole, whole.names[:CORNER]), "torque": _torque(found)}
+    figures = {"corner": plots.corner(whole, shown[-CORNER:]), "torque": _torque(found)}
     if found.windows is not None:
         save_posterior(folder / "windows.nc", found.windows, found.end)
         if found.good.any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,8 +25,8 @@ SMOOTH = 1.6
 """Cells: standard deviation of what smooths the histogram, so that contours are lines and not islands."""
 SPAN, MARGIN = 0.002, 0.15
 """Share of the draws left out at either end of an axis, and how much wider than the others it then is."""
-SMALL = 5
-"""From so many parameters on the letters are smaller."""
+SMALL, ROOM = 5, 7
+"""From so many parameters on the letters are smaller, and from so many the figure is larger."""
 RAYS = 181
 """Directions in which ellipses are held against each other."""
 
@@ -51,7 +52,8 @@ def corner(
     limits = np.stack([_limits(draws) for draws in shown])
     limits = np.stack([limits[:, 0].min(axis=0), limits[:, 1].max(axis=0)])
     n = len(names)
-    figure = Figure(figsize=(WIDTH, WIDTH if n > 2 else WIDTH * 0.7))
+    size = WIDTH * max(1, n / ROOM)
+    figure = Figure(figsize=(size, size if n > 2 else size * 0.7))
     panels = figure.subplots(n, n, squeeze=False)
     for i in range(n):
         for j in range(n):
@@ -67,7 +69,9 @@ def corner(
                     _region(panel, draws[:, [j, i]], filled=k == 0)
             panel.set(xlim=tuple(limits[:, j]), ylim=(0, 1.08) if i == j else tuple(limits[:, i]))
             _truths(panel, truth or {}, names[j], names[i] if i != j else None)
-            _label(panel, [f"{words(names[k])}\n[{pretty_unit(posterior.units[columns[k]])}]" for k in (j, i)], n)
+            width = 40 if n < SMALL else 14
+            labels = [f"{fill(words(names[k]), width)}\n[{pretty_unit(posterior.units[columns[k]])}]" for k in (j, i)]
+            _label(panel, labels, n)
             _outer_only(panel, i, j, n)
     figure.align_labels()
     return figure
@@ -124,11 +128,14 @@ def _truths(panel: Axes, truth: Mapping[str, float], x: str, y: str | None) -> N
 def _label(panel: Axes, labels: Sequence[str], n: int) -> None:
     """Three numbers at most, slanted."""
     panel.locator_params(nbins=3)
+    panel.ticklabel_format(useOffset=False)
     panel.tick_params(axis="x", rotation=40)
     panel.set_xlabel(labels[0], fontsize=6 if n >= SMALL else None)
     panel.set_ylabel(labels[1], fontsize=6 if n >= SMALL else None)
     if n >= SMALL:
         panel.tick_params(labelsize=6.5)
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.get_offset_text().set_fontsize(6)
 
 
 def _outer_only(panel: Axes, i: int, j: int, n: int) -> None:
