@@ -7,7 +7,7 @@ position is corrected for where it matters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -21,7 +21,7 @@ from jaximp.identify import Prepared, in_windows, prepare
 from jaximp.impedance import ArmImpedance, identify_trials
 from jaximp.job import Job
 from jaximp.likelihood import Density, estimate_density, linear_density, noise_names, window_densities
-from jaximp.models import Model
+from jaximp.models import Joints, Model, pathway_of
 from jaximp.noise import (
     Noise,
     Whiteness,
@@ -77,7 +77,8 @@ class Inference:
     """(M,) of `identify` on them: what their model explains, and how their motion excites it."""
     left_out: tuple[str, ...]
     """Why other windows have none."""
-    changes: tuple[Change, ...]
+    gains: dict[str, Numbers]
+    """Of every reflex what makes its gain of the parameters (p,); none without a reflex."""
     noise: Noise
     whiteness: tuple[Whiteness, ...]
     """Of the whitened residuals of each output."""
@@ -117,6 +118,41 @@ class Inference:
         """(M,) windows whose draws and whose verdict can be trusted."""
         return np.zeros(0, bool) if self.windows is None else self.windows.ok & self.verdicts.trusted
 
+    @cached_property
+    def summarised(self) -> tuple[Posterior, PosteriorMany | None]:
+        """Of the whole record and of the windows, with the gain of every reflex in place of its weights."""
+        if not self.gains:
+            return self.whole, self.windows
+        names, p = self.whole.names, len(self.bias)
+        weights = np.any([gain != 0 for gain in self.gains.values()], axis=0)
+        kept = [k for k in range(len(names)) if k >= p or not weights[k]]
+        matrix = np.vstack([np.eye(len(names))[kept], *(np.pad(g, (0, len(names) - p)) for g in self.gains.values())])
+        units = (*(self.whole.units[k] for k in kept), *("N m s/rad",) * len(self.gains))
+        named = (*(names[k] for k in kept), *self.gains)
+
+        def summary(theta: jax.Array) -> jax.Array:
+            return (matrix * theta).sum(axis=1)
+
+        whole, windows = self.whole, self.windows
+        return (
+            derive(whole, summary, named, units),
+            None if windows is None else derive(windows, summary, named, units),
+        )
+
+    @cached_property
+    def changes(self) -> tuple[Change, ...]:
+        """Of every parameter (of a reflex its gain), from each window that can be trusted to the next."""
+        windows = self.summarised[1]
+        if windows is None:
+            return ()
+        found, start, end = [], self.start, self.end
+        for before, after in pairwise(int(k) for k in np.flatnonzero(self.good)):
+            spans = ((start[after], end[after]), (start[before], end[before]))
+            for name in (name for name in windows.names if not name.startswith("log_noise")):
+                chance = probability_greater(windows[after], windows[before], name, spans=spans)
+                found.append(Change(name, (before, after), *chance))
+        return tuple(found)
+
     @property
     def score(self) -> tuple[float, float] | None:
         """Mean log predictive density of the second half of the record from the first, per row, and its standard error;
@@ -133,18 +169,19 @@ class Inference:
     def _contradiction(self) -> str:
         if self.good.sum() < 2:
             return ""
-        assert self.windows is not None
-        samples = self.windows.samples[self.good]
+        windows = self.summarised[1]
+        assert windows is not None
+        samples = windows.samples[self.good]
         mean, variance = samples.mean(axis=1), samples.var(axis=1)
         common = (mean / variance).sum(axis=0) / (1 / variance).sum(axis=0)
         squares = ((mean - common) ** 2 / variance).sum(axis=0)
         p = chi2.sf(squares, len(samples) - 1)
-        told = [k for k, name in enumerate(self.whole.names) if not name.startswith("log_noise")]
+        told = [k for k, name in enumerate(windows.names) if not name.startswith("log_noise")]
         worst = min(told, key=lambda k: float(p[k]))
         if p[worst] >= CONTRADICTION:
             return ""
         return (
-            f"the windows contradict each other in {self.whole.names[worst]} (p = {p[worst]:.1g}): it changes, or the "
+            f"the windows contradict each other in {windows.names[worst]} (p = {p[worst]:.1g}): it changes, or the "
             "model lacks something, and the whole record's draws are those of an average; look at the windows"
         )
 
@@ -175,14 +212,14 @@ def infer_recording(
     progress(0.9)
     left = residuals(data.white, optimum(data.white))
     time, y, kept = prepared.rows.time, data.y.reshape(len(data.y), -1), np.isin(place.starts, start)
-    found = Inference(
+    return Inference(
         whole=whole,
         windows=windows,
         start=time[start],
         end=time[start + place.window - 1],
         verdicts=Verdicts(verdicts.verdict[kept], verdicts.reason[kept]),
         left_out=tuple(f"{time[first]:.4g} s: {why}" for first, why in left_out),
-        changes=(),
+        gains=_gains(data.model),
         noise=data.noise,
         whiteness=tuple(whiteness(left[:, k], data.white.valid[:, k]) for k in range(left.shape[1])),
         bias=data.bias,
@@ -193,7 +230,6 @@ def infer_recording(
         bands=torque_bands(whole.samples, data.W, LEVELS).reshape(len(LEVELS), *y.shape),
         notes=recording.notes,
     )
-    return replace(found, changes=tuple(_changes(found, data.model.names)))
 
 
 def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
@@ -371,20 +407,20 @@ def _prior(job: Job, prepared: Prepared, model: Model, outputs: int) -> Prior:
     return make_prior((*model.names, *noise_names(outputs)), job.posterior.prior, blocks)
 
 
+def _gains(model: Model) -> dict[str, Numbers]:
+    """Of every reflex, joint by joint, what makes its gain of the parameters."""
+    found, parts = {}, model.models if isinstance(model, Joints) else (model,)
+    for j, part in enumerate(parts):
+        if part.memory:
+            pathway, tag = pathway_of(part), f"joint{j + 1}." if len(parts) > 1 else ""
+            weights = [f"{tag}{column}" for column in pathway.columns]
+            of_weights = np.array([column in weights for column in model.columns])
+            found[f"{tag}reflex_gain"] = np.where(of_weights, float(pathway.direction), 0.0)
+    return found
+
+
 def _judged(job: Job, prepared: Prepared) -> tuple[Placement, Verdicts]:
     """Windows one behind the other, and what `identify` says of each."""
     job = replace(job, window=replace(job.window, step=job.window.length))
     place = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters)
     return place, in_windows(job, prepared)[0].verdicts
-
-
-def _changes(found: Inference, names: Sequence[str]) -> Iterator[Change]:
-    """Of every parameter, from each window that can be trusted to the next."""
-    windows, start, end = found.windows, found.start, found.end
-    if windows is None:
-        return
-    for before, after in pairwise(int(k) for k in np.flatnonzero(found.good)):
-        spans = ((start[after], end[after]), (start[before], end[before]))
-        for name in names:
-            chance = probability_greater(windows[after], windows[before], name, spans=spans)
-            yield Change(name, (before, after), *chance)

@@ -163,15 +163,18 @@ def stacked(posteriors: Sequence[Posterior]) -> PosteriorMany:
 
 
 def derive(
-    posterior: Posterior,
+    posterior: Posterior | PosteriorMany,
     function: Callable[[Float[Array, " p"]], Float[Array, " k"]],
     names: Sequence[str],
     units: Sequence[str] | None = None,
-) -> Posterior:
-    """The posterior of what `function` makes of the parameters, such as the elements of K = L L'.
+) -> Any:
+    """The posterior of what `function` makes of the parameters, such as the elements of K = L L'; of each if many.
 
     Its density is not known, and `log_density` stays that of the parameters.
     """
+    if isinstance(posterior, PosteriorMany):
+        function = jax.jit(function)
+        return stacked([derive(one, function, names, units) for one in posterior])
     chains = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(jnp.asarray(posterior.chains)))
     log_density, acceptance = posterior.log_density, posterior.acceptance
     settings: dict[str, Any] = {"log_density": log_density, "acceptance": acceptance, "sampler": posterior.sampler}

@@ -44,15 +44,15 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
 
     **Returns:** the summary.
     """
-    folder, whole = Path(folder), found.whole
+    folder, (whole, windows) = Path(folder), found.summarised
     human = [name for name in whole.names if name.startswith("human.")]  # the robot's are those of its own recording
     shown = human or [name for name in whole.names if not name.startswith("log_noise")]
-    save_posterior(folder / "posterior.nc", whole)
+    save_posterior(folder / "posterior.nc", found.whole)
     figures = {"corner": plots.corner(whole, shown[-CORNER:]), "torque": _torque(found)}
-    if found.windows is not None:
+    if found.windows is not None and windows is not None:
         save_posterior(folder / "windows.nc", found.windows, found.end)
         if found.good.any():
-            figures["bands"] = plots.bands(found.end, found.windows, shown, trusted=found.good)
+            figures["bands"] = plots.bands(found.end, windows, shown, trusted=found.good)
     content = _content(job, whole, "the whole record", shown, _remarks(found, job.posterior.heavy_tails), found.why)
     content["changes"] = [
         {"parameter": one.parameter, "from_s": found.end[one.windows[0]], "to_s": found.end[one.windows[1]],
@@ -135,8 +135,7 @@ def _remarks(found: Inference, heavy_tails: bool) -> list[str]:
 
 
 def _windows(found: Inference) -> list[dict[str, Any]]:
-    if found.windows is None:
-        return []
+    windows = found.summarised[1]
     return [
         {
             "start_s": found.start[k],
@@ -145,7 +144,7 @@ def _windows(found: Inference) -> list[dict[str, Any]]:
             "why": one.why or found.verdicts.reason[k],
             "parameters": summarise(one),
         }
-        for k, one in enumerate(found.windows)
+        for k, one in enumerate(windows or ())
     ]
 
 
