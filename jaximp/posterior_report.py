@@ -28,13 +28,16 @@ TITLES = {
 }
 CAPTIONS = {
     "bands": "Median, and bands that hold 50 and 95 %, of windows that share no samples, each by itself.",
-    "torque": "The filtered torque, and the band that should hold 95 % of it, by the posterior of the whole record. "
-    "Where the torque leaves it for long, the model lacks something, or a parameter has changed.",
+    "torque": "The filtered torque in the middle of the record, and the band that should hold 95 % of it, by the "
+    "posterior of the whole record. Where the torque leaves it for long, the model lacks something, or a parameter has "
+    "changed.",
     "ellipses": "Bands that hold 50 and 95 % of the draws in every direction.",
     "corner": "Of every pair the regions of highest density that hold 50 and 95 %. Narrow slanting ones: the data tell "
     "a combination of the two, and neither well.",
 }
 """Figures in the order of the report, and how to read them."""
+SHOWN = 10.0
+"""Torque that is shown [s], or two windows of it if they are longer."""
 CORNER = 12
 """Parameters that are shown two by two, at most: the last ones, which are the stiffnesses."""
 
@@ -48,7 +51,10 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     human = [name for name in whole.names if name.startswith("human.")]  # the robot's are those of its own recording
     shown = human or [name for name in whole.names if not name.startswith("log_noise")]
     save_posterior(folder / "posterior.nc", found.whole)
-    figures = {"corner": plots.corner(whole, shown[-CORNER:]), "torque": _torque(found)}
+    figures = {
+        "corner": plots.corner(whole, shown[-CORNER:]),
+        "torque": _torque(found, max(SHOWN, 2 * job.window.length)),
+    }
     if found.windows is not None and windows is not None:
         save_posterior(folder / "windows.nc", found.windows, found.end)
         if found.good.any():
@@ -148,9 +154,13 @@ def _windows(found: Inference) -> list[dict[str, Any]]:
     ]
 
 
-def _torque(found: Inference) -> Any:
-    first: Numbers = found.bands[:, :, 0]
-    return plots.torque_bands(found.time, found.torque[:, 0], first)
+def _torque(found: Inference, length: float) -> Any:
+    """Of the first joint, so much time [s] in the middle of what counted."""
+    counted = np.isfinite(found.torque[:, 0])
+    middle = np.median(found.time[counted])
+    shown = np.abs(found.time - middle) <= length / 2
+    bands: Numbers = np.where(counted, found.bands[:, :, 0], np.nan)
+    return plots.torque_bands(found.time[shown], found.torque[shown, 0], bands[:, shown])
 
 
 def _write(folder: Path, content: dict[str, Any], figures: dict[str, Any]) -> dict[str, Any]:
