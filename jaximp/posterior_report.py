@@ -60,11 +60,7 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
         if found.good.any():
             figures["bands"] = plots.bands(found.end, windows, shown, trusted=found.good)
     content = _content(job, whole, "the whole record", shown, _remarks(found, job.posterior.heavy_tails), found.why)
-    content["changes"] = [
-        {"parameter": one.parameter, "from_s": found.end[one.windows[0]], "to_s": found.end[one.windows[1]],
-         "probability": one.probability, "error": one.error}
-        for one in found.changes
-    ]  # fmt: skip
+    content["changes"] = _changes(found, shown)
     content["held_out_log_score"] = None if found.score is None else list(found.score)
     content["share_of_torque_in_95_percent_band"] = found.inside
     content["windows"] = _windows(found)
@@ -138,6 +134,19 @@ def _remarks(found: Inference, heavy_tails: bool) -> list[str]:
             f"at {found.start[k]:.4g} s: {found.verdicts.verdict[k]}, {found.verdicts.reason[k]}"
         )
     return [*remarks, *(f"no posterior of the window at {line}" for line in found.left_out), *found.notes]
+
+
+def _changes(found: Inference, shown: Sequence[str]) -> list[dict[str, Any]]:
+    """From window to window, how probable it is that each parameter rose, and the Monte Carlo standard error."""
+    table: dict[tuple[int, int], dict[str, Any]] = {}
+    for one in (one for one in found.changes if one.parameter in shown):
+        before, after = one.windows
+        row = table.setdefault(
+            one.windows,
+            {"from_s": found.end[before], "to_s": found.end[after], "probability": {}, "error": {}},
+        )
+        row["probability"][one.parameter], row["error"][one.parameter] = one.probability, one.error
+    return list(table.values())
 
 
 def _windows(found: Inference) -> list[dict[str, Any]]:
