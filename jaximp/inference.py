@@ -41,7 +41,7 @@ from jaximp.priors import MultivariateNormal, Prior, make_prior
 from jaximp.regression import Placement, noisy_columns, windows_in_rows
 from jaximp.samplers import sample_many, sample_posterior
 from jaximp.signals import require_float64
-from jaximp.trust import Verdicts
+from jaximp.trust import TRUSTED, Verdicts
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 
 CONTRADICTION = 1e-3
@@ -117,6 +117,12 @@ class Inference:
     def good(self) -> np.ndarray:
         """(M,) windows whose draws and whose verdict can be trusted."""
         return np.zeros(0, bool) if self.windows is None else self.windows.ok & self.verdicts.trusted
+
+    def reason(self, k: int) -> str:
+        """Why a window cannot be trusted, by its draws or by what else is known of it; empty where it can."""
+        assert self.windows is not None
+        verdict = self.verdicts.verdict[k]
+        return self.windows[k].why or ("" if verdict == TRUSTED else f"{verdict}, {self.verdicts.reason[k]}")
 
     @cached_property
     def summarised(self) -> tuple[Posterior, PosteriorMany | None]:

@@ -126,12 +126,12 @@ def _remarks(found: Inference, heavy_tails: bool) -> list[str]:
         remarks.append(
             f"the prior expects {low:.2g} to {high:.2g} times the torque that was measured: they contradict each other"
         )
-    distrusted = np.flatnonzero(~found.verdicts.trusted)
+    distrusted = np.flatnonzero(~found.good)
     if len(distrusted):
         k = distrusted[len(distrusted) // 2]
         remarks.append(
-            f"{len(distrusted)} of {len(found.end)} windows are not to be trusted, whatever their draws say; the one "
-            f"at {found.start[k]:.4g} s: {found.verdicts.verdict[k]}, {found.verdicts.reason[k]}"
+            f"{len(distrusted)} of {len(found.end)} windows are not to be trusted; the one at {found.start[k]:.4g} s: "
+            f"{found.reason(int(k))}"
         )
     return [*remarks, *(f"no posterior of the window at {line}" for line in found.left_out), *found.notes]
 
@@ -156,7 +156,7 @@ def _windows(found: Inference) -> list[dict[str, Any]]:
             "start_s": found.start[k],
             "end_s": found.end[k],
             "verdict": found.verdicts.verdict[k],
-            "why": one.why or found.verdicts.reason[k],
+            "why": found.reason(k),
             "parameters": summarise(one),
         }
         for k, one in enumerate(windows or ())
