@@ -43,6 +43,8 @@ LAGS = 20
 ATTENUATION = 0.25
 """Noise in the regressor is corrected for where it moves an estimate by this many standard errors: 95 % intervals then
 hold the truth in 94.3 % of all cases."""
+ROUNDS, SETTLED = 8, 0.005
+"""How often optimum and autoregressions are found in turns at most, and the change of coefficients that ends it."""
 PLAIN = np.ones(1)
 
 
@@ -164,16 +166,29 @@ def fit_noise(
     """What is known of the noise, with the autoregressions that the residuals of the whole record demand.
 
     Arguments as for `whiten`. The residuals are those of the optimum; with the autoregressions it moves a little, so
-    both are found twice, one after the other (Cochrane and Orcutt 1949).
+    both are found in turns (Cochrane and Orcutt 1949). The optimum has followed some of the slow
+    noise, and what it took is given back: `e e'` is expected to be `r r' + W V W'`, with the residuals r and the
+    covariance V of the optimum (expectation maximisation of the restricted likelihood, Laird and Ware 1982).
     """
     noise = noise if isinstance(noise, Noise) else Noise() if noise is None else Noise(np.asarray(noise))
     plain = found = replace(noise, autoregression=())
     rows = whiten(W, y, plain, valid)
-    for _ in range(2):
-        residual = residuals(rows, optimum(whiten(W, y, found, valid)))
-        coefficients = tuple(fit_autoregression(residual[:, k], rows.valid[:, k]) for k in range(residual.shape[1]))
-        found = replace(plain, autoregression=coefficients if any(len(c) for c in coefficients) else ())
+    for _ in range(ROUNDS):
+        theta, root = _optimum_and_root(whiten(W, y, found, valid))
+        residual, lost = residuals(rows, theta), rows.W @ root
+        coefficients = tuple(
+            fit_autoregression(residual[:, k], rows.valid[:, k], lost[:, k]) for k in range(residual.shape[1])
+        )
+        before, found = found, replace(plain, autoregression=coefficients if any(map(len, coefficients)) else ())
+        if _alike(before.autoregression, found.autoregression):
+            break
     return found
+
+
+def _alike(before: tuple[Numbers, ...], after: tuple[Numbers, ...]) -> bool:
+    return len(before) == len(after) and all(
+        len(a) == len(b) and np.allclose(a, b, rtol=0, atol=SETTLED) for a, b in zip(before, after, strict=True)
+    )
 
 
 def optimum(rows: WhiteRows) -> Numbers:
@@ -223,24 +238,30 @@ def whiteness(
     return Whiteness(statistic, float(chi2.sf(statistic, lags - fitted)), lags)
 
 
-def fit_autoregression(residual: Num[AnyArray, " R"], valid: Shaped[AnyArray, " R"] | None = None) -> Numbers:
+def fit_autoregression(
+    residual: Num[AnyArray, " R"],
+    valid: Shaped[AnyArray, " R"] | None = None,
+    lost: Num[AnyArray, "R p"] | None = None,
+) -> Numbers:
     """(k,) coefficients by which residuals follow from those before; none where `whiteness` is not refuted.
 
     Refuted is what white noise would do in less than `SIGNIFICANCE` of all records. The order is then the one, up to
-    10 log10(R), with the smallest information criterion of Schwarz.
+    10 log10(R), with the smallest information criterion of Schwarz. `lost` are further series, whose products count
+    with those of the residuals: what a fit took from the noise, see `fit_noise`.
 
     **Source:** Burg 1975, whose coefficients are always those of a stable process; pairs of valid rows count.
     """
     counts = np.ones(len(residual)) if valid is None else np.asarray(valid, float)
-    forward = np.where(counts > 0, np.asarray(residual, float), 0)
-    n, backward, polynomial, power = counts.sum(), forward.copy(), np.ones(1), 1.0
-    if not whiteness(forward, counts).p < SIGNIFICANCE:
+    if not whiteness(residual, counts).p < SIGNIFICANCE:
         return np.zeros(0)
+    series = np.asarray(residual, float)[:, None] if lost is None else np.column_stack([residual, lost])
+    forward = np.where(counts[:, None] > 0, series, 0)
+    n, backward, polynomial, power = counts.sum(), forward.copy(), np.ones(1), 1.0
     orders = [(0.0, polynomial)]
     for _ in range(int(min(10 * np.log10(n), n // 3))):
         forward, backward, counts = forward[1:], backward[:-1], counts[1:] * counts[:-1]
-        f, b = forward * counts, backward * counts
-        reflection = -2 * (f @ b) / (f @ f + b @ b)
+        f, b = forward * counts[:, None], backward * counts[:, None]
+        reflection = -2 * (f * b).sum() / ((f * f).sum() + (b * b).sum())
         forward, backward = forward + reflection * backward, backward + reflection * forward
         polynomial = np.r_[polynomial, 0] + reflection * np.r_[0, polynomial[::-1]]
         power *= 1 - reflection**2
@@ -325,6 +346,15 @@ def _optimum_and_scale(rows: WhiteRows) -> tuple[Numbers, Numbers]:
     theta = optimum(rows)
     scale = np.linalg.norm(residuals(rows, theta), axis=0) / np.sqrt(np.maximum(rows.count, 1))
     return theta, np.where(scale > 0, scale, 1)
+
+
+def _optimum_and_root(rows: WhiteRows) -> tuple[Numbers, Numbers]:
+    """Least squares, and a root (p, p) of its covariance: root root'."""
+    theta, scale = _optimum_and_scale(rows)
+    columns = (rows.W / scale[:, None]).reshape(-1, len(theta))
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0, size, 1)
+    return theta, np.linalg.pinv(np.linalg.qr(columns / size, mode="r")) / size[:, None]
 
 
 def _covariances(column_noise: AnyArray, n: int, p: int) -> Numbers:
