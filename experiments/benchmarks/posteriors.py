@@ -247,8 +247,8 @@ def table(found: dict[str, Any]) -> list[str]:
         )
     lines += [
         "",
-        f"The first call, which compiles, takes {one['first_call_s']:.1f} s. By emcee's own autocorrelation time, which "
-        f"does not split chains, plain emcee has {one['plain_own_per_s']:.0f} a second.",
+        f"The first call, which compiles, takes {one['first_call_s']:.1f} s. By emcee's own autocorrelation time plain "
+        f"emcee has {one['plain_own_per_s']:.0f} effective samples a second.",
         "",
     ]
     lines += [f"{WINDOWS} posteriors, {ESS} effective samples of every parameter asked for, `sample_many`:", ""]
