@@ -13,12 +13,14 @@ textbooks. With torque noise that drifts, of which the filters know nothing: wit
 that the residuals of the whole record demand. For one case of the rig, and for the arm with its definite stiffness,
 emcee and the sampler of many windows draw from the posteriors of the same records: those that the diagnostics refuse
 are counted, and stay in the table. With the paper's letter, filters inside every window, there is a bias instead:
-coverage.py has it, and its numbers stand below the table. Writes experiments/results/calibration.json and .md.
+coverage.py has it, and its numbers stand below the table. Writes experiments/results/calibration.json and .md; names of
+studies as arguments for these alone.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -231,21 +233,31 @@ def markdown(summary: dict[str, Any], literal: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def studies(generator: np.random.Generator) -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
+def studies() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
     """The name of every study, and what makes it: cases, ways, parameters."""
     cases = {f"{'quantised' if q else 'exact'} encoder, every {n}": (q, n) for q in (True, False) for n in DECIMATIONS}
+    random = [np.random.default_rng([2024, k]) for k in range(3)]
     return {
-        "rig": lambda: {name: rig(*case, generator, samplers=name == SAMPLED) for name, case in cases.items()},
-        "rig, drifting noise": lambda: {"every 40": drifting_rig(40, generator)},
-        "arm": lambda: {"9200 samples": arm(generator, samplers=True)},
+        "rig": lambda: {name: rig(*case, random[0], samplers=name == SAMPLED) for name, case in cases.items()},
+        "rig, drifting noise": lambda: {"every 40": drifting_rig(40, random[1])},
+        "arm": lambda: {"9200 samples": arm(random[2], samplers=True)},
     }
 
 
-if __name__ == "__main__":
-    results = {name: study() for name, study in studies(np.random.default_rng(2024)).items()}
-    summary = {name: summarise(cases) for name, cases in results.items()}
+def save(name: str, cases: dict[str, dict[str, Any]]) -> str:
+    """Put one study's results among those of the others, and return the table."""
     folder = Path(__file__).parent / "results"
+    path = folder / "calibration.json"
+    before = json.loads(path.read_text()) if path.exists() else {"summary": {}, "cells": {}}
+    cells, summary = before["cells"] | {name: cases}, before["summary"] | {name: summarise(cases)}
+    cells, summary = dict(sorted(cells.items())), dict(sorted(summary.items()))
     text = markdown(summary, json.loads((folder / "coverage.json").read_text())["summary"])
-    (folder / "calibration.json").write_text(json.dumps({"summary": summary, "cells": results}, indent=1) + "\n")
+    path.write_text(json.dumps({"summary": summary, "cells": cells}, indent=1) + "\n")
     (folder / "calibration.md").write_text(text)
-    print(text)
+    return text
+
+
+if __name__ == "__main__":
+    for name, study in studies().items():
+        if name in (sys.argv[1:] or studies()):
+            print(save(name, study()))
