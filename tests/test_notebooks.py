@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,13 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 600_000
 """Of a notebook with its figures [bytes]."""
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+DATA = Path(os.environ.get("JAXIMP_DATA") or ROOT / "../shared/data").resolve()
+"""Real recordings; a notebook that looks for them runs without them as well."""
+RUNS = [pytest.param(path, DATA, id=path.stem) for path in NOTEBOOKS] + [
+    pytest.param(path, DATA / "nowhere", id=f"{path.stem}, without recordings")
+    for path in NOTEBOOKS
+    if DATA.is_dir() and "JAXIMP_DATA" in path.read_text(encoding="utf-8")
+]
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
 
 
@@ -35,8 +43,9 @@ def test_there_are_notebooks() -> None:
     assert NOTEBOOKS
 
 
-@every_notebook
-def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("path", "data"), RUNS)
+def test_it_runs(path: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JAXIMP_DATA", str(data))
     for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "MPLCONFIGDIR"):
         monkeypatch.setenv(name, str(tmp_path / name))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
