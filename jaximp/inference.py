@@ -297,11 +297,13 @@ class _Data:
     """(N, *n, p) what noise of the position makes of the columns."""
     filtered: AnyArray | None
     """What the filters make of white noise, by lag."""
+    stretch: int
+    """Rows of a window."""
     prior: Prior
 
     @cached_property
     def noise(self) -> Noise:
-        return fit_noise(self.W, self.y, self.filtered, self.valid)
+        return fit_noise(self.W, self.y, self.filtered, self.valid, self.stretch)
 
     @cached_property
     def white(self) -> WhiteRows:
@@ -400,7 +402,8 @@ def _data(job: Job, prepared: Prepared) -> _Data:
     W, y, valid = (np.asarray(x) for x in (prepared.rows.W, prepared.rows.torque, prepared.rows.valid))
     difference = noisy_columns(model, prepared.recording, job, prepared.filters)
     prior = _prior(job, prepared, model, 1 if y.ndim == 1 else y.shape[1])
-    return _Data(job, model, W, y, valid, difference, prepared.noise, prior)
+    window = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters).window
+    return _Data(job, model, W, y, valid, difference, prepared.noise, window, prior)
 
 
 def _prior(job: Job, prepared: Prepared, model: Model, outputs: int) -> Prior:

@@ -33,6 +33,8 @@ RIDGE = 1e-8
 """Share of the largest spectral density that is added to all of it, so that the Cholesky factor exists."""
 LARGEST_BAND = 200_000_000
 """Numbers that a band matrix may have (1.6 GB)."""
+EXACT = 2000
+"""Rows of a stretch up to which autoregressions are part of the covariance."""
 PIECE, OVERLAP = 6, 4
 """Of long records: rows that are whitened at a time, and rows before them that count as their past, both in bands of
 the covariance. With a high-pass of 0.3 Hz this moves estimates by 0.0005 standard errors."""
@@ -80,11 +82,7 @@ class Noise:
         ridge = RIDGE * float(_density(r).max())
         if not self.autoregression or not len(self.autoregression[k]):
             return r, ridge
-        polynomial = np.r_[1, -self.autoregression[k]]
-        slowest = min(0.9999, np.abs(np.roots(polynomial)).max())
-        density = _density(r, len(r) + int(np.ceil(-25 / np.log(slowest))))
-        whole = np.fft.irfft(density / np.abs(np.fft.rfft(polynomial, 2 * (len(density) - 1))) ** 2)
-        whole = whole[: len(whole) // 2]
+        whole = _with_autoregression(r, self.autoregression[k])
         return whole[: np.flatnonzero(np.abs(whole) > 1e-10 * whole[0])[-1] + 1] / whole[0], ridge / whole[0]
 
 
@@ -134,6 +132,9 @@ def whiten(
     **Arguments:** `W` (S, p) or (S, n, p); `y` (S,) or (S, n) [N m]; `noise`, or its autocovariance by lag, else it is
     taken as white; `valid` False for rows that must not count, whatever they hold. They are cut out, exactly.
 
+    Autoregressions join the covariance in stretches of up to `EXACT` rows. In longer ones they follow it, and the first
+    rows after every gap, whose past is not known, do not count.
+
     **Raises:** ValueError for an autocovariance whose memory is too long for the rows, and values that are not finite.
 
     **Source:** generalised least squares (Aitken 1936) by a banded Cholesky factor.
@@ -147,6 +148,8 @@ def whiten(
         raise ValueError(
             f"noise has {len(noise.autoregression)} autoregressions for {y.shape[1]} outputs: one for each"
         )
+    if noise.autoregression and len(y) > EXACT * noise.every:
+        return _predicted(whiten(W, y, replace(noise, autoregression=()), valid), noise)
     W, y, valid = (x[:: noise.every] for x in (W, y, valid))
     columns = np.where(valid[..., None], np.concatenate([W, y[..., None]], axis=-1), 0)
     if not np.isfinite(columns).all():
@@ -162,20 +165,22 @@ def fit_noise(
     y: Num[AnyArray, "S *n"],
     noise: Noise | Num[AnyArray, " L"] | None = None,
     valid: Shaped[AnyArray, "S *n"] | None = None,
+    stretch: int | None = None,
 ) -> Noise:
     """What is known of the noise, with the autoregressions that the residuals of the whole record demand.
 
-    Arguments as for `whiten`. The residuals are those of the optimum; with the autoregressions it moves a little, so
-    both are found in turns (Cochrane and Orcutt 1949). The optimum has followed some of the slow
-    noise, and what it took is given back: `e e'` is expected to be `r r' + W V W'`, with the residuals r and the
-    covariance V of the optimum (expectation maximisation of the restricted likelihood, Laird and Ware 1982).
+    Arguments as for `whiten`; `stretch` rows have parameters of their own, so that what changes from one stretch to the
+    next does not pass for noise: without it all rows share theirs. The residuals are those of the optimum; with the
+    autoregressions it moves a little, so both are found in turns (Cochrane and Orcutt 1949). The optimum has followed
+    some of the slow noise, and what it took is given back: `e e'` is expected to be `r r' + W V W'`, with the residuals
+    r and the covariance V of the optimum (expectation maximisation of the restricted likelihood, Laird and Ware 1982).
     """
     noise = noise if isinstance(noise, Noise) else Noise() if noise is None else Noise(np.asarray(noise))
     plain = found = replace(noise, autoregression=())
     rows = whiten(W, y, plain, valid)
+    length = len(rows.y) if stretch is None else max(1, stretch // noise.every)
     for _ in range(ROUNDS):
-        theta, root = _optimum_and_root(_predicted(rows, found.autoregression))
-        residual, lost = residuals(rows, theta), rows.W @ root
+        residual, lost = _residuals_by_stretch(rows, found, length)
         coefficients = tuple(
             fit_autoregression(residual[:, k], rows.valid[:, k], lost[:, k]) for k in range(residual.shape[1])
         )
@@ -185,19 +190,39 @@ def fit_noise(
     return found
 
 
-def _predicted(rows: WhiteRows, autoregression: tuple[Numbers, ...]) -> WhiteRows:
-    """Rows less what those before say of them: near those that `whiten` makes, and cheap; where all of these count."""
+def _residuals_by_stretch(rows: WhiteRows, noise: Noise, length: int) -> tuple[Numbers, Numbers]:
+    """(R, n) residuals of the optimum of every stretch, and (R, n, p) what it took from the noise."""
+    predicted, left, lost = _predicted(rows, noise), np.zeros_like(rows.y), np.zeros_like(rows.W)
+    starts = range(0, max(1, len(rows.y) - length // 2), length)
+    for first, last in zip(starts, (*starts[1:], len(rows.y)), strict=True):
+        part = slice(first, last)
+        theta, root = _optimum_and_root(_rows_of(predicted, part))
+        left[part], lost[part] = residuals(_rows_of(rows, part), theta), rows.W[part] @ root
+    return left, lost
+
+
+def _rows_of(rows: WhiteRows, part: slice) -> WhiteRows:
+    valid = rows.valid[part]
+    share = valid.sum(axis=0) / np.maximum(rows.valid.sum(axis=0), 1)
+    return WhiteRows(rows.W[part], rows.y[part], valid, rows.count * share, rows.size[part])
+
+
+def _predicted(rows: WhiteRows, noise: Noise) -> WhiteRows:
+    """Rows less what those before say of them, where all of these count; `rows` are white but for autoregressions."""
     from scipy.signal import lfilter
 
-    columns, valid = rows.columns(), rows.valid.copy()
-    for k, coefficients in enumerate(autoregression):
+    columns, valid, size = rows.columns(), rows.valid.copy(), rows.size.copy()
+    for k, coefficients in enumerate(noise.autoregression):
         order = len(coefficients)
-        columns[k] = lfilter(np.r_[1, -coefficients], 1.0, columns[k], axis=0)
+        # The scale of the noise is that of a row, as elsewhere, and not of what is new in it.
+        scale = np.sqrt(_with_autoregression(noise.autocovariance[:: noise.every], coefficients)[0])
+        columns[k] = scale * lfilter(np.r_[1, -coefficients], 1.0, columns[k], axis=0)
+        size[:, k] /= scale
         known = np.cumsum(np.r_[np.zeros(order + 1), rows.valid[:, k]])
         valid[:, k] = known[order + 1 :] - known[: -order - 1] == order + 1
     columns *= valid.T[..., None]
     count = rows.count * valid.sum(axis=0) / np.maximum(rows.valid.sum(axis=0), 1)
-    return WhiteRows(columns[..., :-1].swapaxes(0, 1), columns[..., -1].T, valid, count, rows.size)
+    return WhiteRows(columns[..., :-1].swapaxes(0, 1), columns[..., -1].T, valid, count, size)
 
 
 def _alike(before: tuple[Numbers, ...], after: tuple[Numbers, ...]) -> bool:
@@ -424,6 +449,15 @@ def _band_factor(lags: bytes, ridge: float, valid: bytes) -> Numbers:
         band[k, : n - k] = np.where(apart < len(r), r[np.minimum(apart, len(r) - 1)], 0)
     band[0] += ridge
     return np.asarray(cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
+
+
+def _with_autoregression(r: Numbers, coefficients: Numbers) -> Numbers:
+    """Autocovariance by lag of what the filters, with the autocovariance r, made of noise that followed from itself."""
+    polynomial = np.r_[1, -coefficients]
+    slowest = min(0.9999, np.abs(np.roots(polynomial)).max(initial=0.5))
+    density = _density(r, len(r) + int(np.ceil(-25 / np.log(slowest))))
+    whole = np.fft.irfft(density / np.abs(np.fft.rfft(polynomial, 2 * (len(density) - 1))) ** 2)
+    return np.asarray(whole[: len(whole) // 2])
 
 
 def _density(r: Numbers, memory: int = 0) -> Numbers:
