@@ -141,9 +141,9 @@ def rig(
 
 
 def rig_density(triangle: Numbers, count: float) -> Density:
-    rows = WhiteRows(
-        triangle[:, None, :-1], triangle[:, -1:], np.ones((len(triangle), 1), bool), np.array([float(count)])
-    )
+    n = len(triangle)
+    valid, size = np.ones((n, 1), bool), np.ones((n, 1))
+    rows = WhiteRows(triangle[:, None, :-1], triangle[:, -1:], valid, np.array([float(count)]), size)
     return linear_density(RIG[:-1], ("kg m^2", "N m s/rad", "N m/rad", "N m"), rows)
 
 

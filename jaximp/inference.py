@@ -15,7 +15,7 @@ from itertools import pairwise
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from jaximp.identify import Prepared, in_windows, prepare
 from jaximp.impedance import ArmImpedance, identify_trials
@@ -27,6 +27,7 @@ from jaximp.noise import (
     Whiteness,
     WhiteRows,
     attenuation,
+    disagreement,
     fit_noise,
     optimum,
     residuals,
@@ -45,7 +46,7 @@ from jaximp.trust import TRUSTED, Verdicts
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 
 CONTRADICTION = 1e-3
-"""Windows whose parameters differ more than this is probable contradict each other."""
+"""Windows, or estimates, that differ more than this is probable contradict each other."""
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Of the bands of torque."""
 
@@ -84,6 +85,8 @@ class Inference:
     """Of the whitened residuals of each output."""
     bias: Numbers
     """(p,) of least squares by noise of the position, in standard errors; draws are free of it beyond 0.25."""
+    shift: Numbers
+    """(p,) by which the noise that the residuals demand moves the estimate, in standard errors of the difference."""
     held_out: Numbers | None
     """(R, n) log predictive density of the second half of the record from the first, row by row, NaN where it does not
     count; None where the first half alone determines nothing."""
@@ -102,7 +105,7 @@ class Inference:
 
         Some window must be trusted by `identify`, and they must not contradict each other: the squares of their
         differences from the common mean, in standard deviations, are those of chi-squared where nothing changes
-        (Cochran 1954).
+        (Cochran 1954). Noise that the residuals demand must not move the estimate (`noise.disagreement`).
         """
         if self.whole.why or self.windows is None:
             return self.whole.why
@@ -111,7 +114,7 @@ class Inference:
             return (
                 f"no window can be trusted; that in the middle: {self.verdicts.verdict[k]}, {self.verdicts.reason[k]}"
             )
-        return self._contradiction()
+        return self._contradiction() or self._shifted()
 
     @property
     def good(self) -> np.ndarray:
@@ -191,6 +194,16 @@ class Inference:
             "model lacks something, and the whole record's draws are those of an average; look at the windows"
         )
 
+    def _shifted(self) -> str:
+        k = int(np.abs(self.shift).argmax())
+        p = 2 * norm.sf(np.abs(self.shift[k])) * len(self.shift)
+        if p >= CONTRADICTION:
+            return ""
+        return (
+            f"what the residuals have in common, taken for noise, moves {self.whole.names[k]} by "
+            f"{np.abs(self.shift[k]):.2g} standard errors: it is no noise, but something that the model lacks"
+        )
+
 
 def infer(job: Job, progress: Progress = lambda share: None) -> Inference:
     """Posteriors of a job with a recording.
@@ -229,6 +242,7 @@ def infer_recording(
         noise=data.noise,
         whiteness=tuple(whiteness(left[:, k], data.white.valid[:, k]) for k in range(left.shape[1])),
         bias=data.bias,
+        shift=disagreement(data.W, data.y, data.noise, data.valid),
         held_out=data.held_out(),
         prior=prior_predictive(data.prior, data.W[data.valid], data.y[data.valid]),
         time=time,

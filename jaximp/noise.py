@@ -323,6 +323,45 @@ def whitened_covariance(
     return np.einsum("rni,rnj->nij", rows.W, rows.W) / np.maximum(rows.count, 1)[:, None, None]
 
 
+def disagreement(
+    W: Num[AnyArray, "S *n p"],
+    y: Num[AnyArray, "S *n"],
+    noise: Noise,
+    valid: Shaped[AnyArray, "S *n"] | None = None,
+) -> Numbers:
+    """(p,) by how many standard errors of the difference the optimum moves with the autoregressions.
+
+    Arguments as for `whiten`. Both estimates are right where the model is, and weigh frequencies differently; what they
+    disagree about is no noise, but something that the model lacks. Zero without autoregressions.
+
+    **Source:** Hausman 1978; the optimum without them has the covariance `inv(M) W' C W inv(M)`, with M = W'W and the
+    covariance C of the noise (White 1980).
+    """
+    from scipy.signal import lfilter
+
+    rows = whiten(W, y, replace(noise, autoregression=()), valid)
+    if not noise.autoregression:
+        return np.zeros(rows.W.shape[-1])
+    theta, scale = _optimum_and_scale(rows)
+    predicted = _predicted(rows, noise)
+    better, level = _optimum_and_scale(predicted)
+    unit = np.linalg.norm(rows.W.reshape(-1, len(theta)), axis=0)
+    unit = np.where(unit > 0, unit, 1)
+    M, middle, M_better = np.zeros((3, len(theta), len(theta)))
+    for k, coefficients in enumerate(noise.autoregression):
+        columns, after = rows.W[:, k] / unit, predicted.W[:, k] / unit
+        # Every row's share in all rows that follow from it, in units of what is new in a row.
+        answers = lfilter([1.0], np.r_[1, -coefficients], columns[::-1], axis=0)
+        new = level[k] * (predicted.size[:, k] / rows.size[:, k])[0]
+        M += columns.T @ columns / scale[k] ** 2
+        middle += answers.T @ answers * (new**2 / scale[k] ** 4)
+        M_better += after.T @ after / level[k] ** 2
+    inverse, ideal = (np.linalg.pinv(one, hermitian=True) for one in (M, M_better))
+    variance, least = np.diagonal(inverse @ middle @ inverse), np.diagonal(ideal)
+    apart = np.sqrt(np.maximum(variance - least, 0.01 * least))
+    return np.asarray((theta - better) * unit / np.where(apart > 0, apart, 1))
+
+
 def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"]) -> Numbers:
     """(p,) bias of least squares by noise in the regressor, in standard errors: `-inv(W'W) S Sigma theta`.
 

@@ -33,6 +33,7 @@ from jaximp.models import PlanarArm
 from jaximp.noise import (
     Noise,
     attenuation,
+    disagreement,
     fit_autoregression,
     fit_noise,
     joined,
@@ -522,6 +523,35 @@ def test_too_few_rows_and_no_noise_are_refused() -> None:
         joined([])
     with pytest.raises(ValueError, match=r"filter\.mode = 'once'"):
         Noise(np.array([0.5, 1.0]))
+
+
+def test_noise_that_is_noise_does_not_move_the_estimate() -> None:
+    """Standard normal where the model is right; beyond all errors where it lacks something."""
+    r, moved = signals.autocovariance(LOW_PASS, 20), {"noise": [], "lack": []}
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        u = random.normal(size=(20000, 3)) * [10, 1, 0.1]
+        noise = lfilter([1], [1, -0.995], random.normal(size=20000))
+        lack = 100 * np.roll(u[:, 2], 40)
+        for case, torque in (("noise", u @ THETA + 0.3 * noise), ("lack", u @ THETA + 0.3 * noise + lack)):
+            rows = np.asarray(signals.filter_zero_phase(LOW_PASS, np.column_stack([u, torque])))[::20]
+            found = fit_noise(rows[:, :3], rows[:, 3], r)
+            assert found.autoregression
+            moved[case].append(disagreement(rows[:, :3], rows[:, 3], found))
+    z = np.array(moved["noise"])
+    assert (np.abs(z.mean(axis=0)) < 4 * z.std(axis=0) / np.sqrt(len(z))).all()
+    assert ((z.std(axis=0) > 0.7) & (z.std(axis=0) < 1.35)).all()
+    assert np.median(np.abs(moved["lack"]), axis=0)[2] > 4
+    assert not disagreement(rows[:, :3], rows[:, 3], Noise(r)).any()
+
+
+def test_a_change_from_stretch_to_stretch_is_no_noise() -> None:
+    W, y = record(4000, noise=1.0)
+    motion = 0.3 * np.sin(np.arange(4000) / 10)
+    W[:, 2] = motion
+    y = W @ THETA + np.where(np.arange(4000) < 2000, 0, 10) * motion + np.random.default_rng(1).normal(size=4000)
+    assert fit_noise(W, y).autoregression
+    assert not fit_noise(W, y, stretch=500).autoregression
 
 
 # Noise in the regressor
