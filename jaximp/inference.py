@@ -88,8 +88,8 @@ class Inference:
     shift: Numbers
     """(p,) by which the noise that the residuals demand moves the estimate, in standard errors of the difference."""
     held_out: Numbers | None
-    """(R, n) log predictive density of the second half of the record from the first, row by row, NaN where it does not
-    count; None where the first half alone determines nothing."""
+    """(R, n) log predictive density of the second half of the record by its motion and the first half, row by row, NaN
+    where it does not count; None where the first half alone determines nothing."""
     prior: PriorPredictive
     time: Numbers
     """(N,) [s]"""
@@ -256,7 +256,7 @@ def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
     """By how much the first model predicts the held-out torque better than the second, and its standard error.
 
     The mean difference of the log predictive density per row, over rows that count for both: of the same recording
-    through the same filters.
+    through the same filters. Every model has its own size of noise, and no autoregression.
     """
     if first.held_out is None or second.held_out is None:
         raise ValueError("half of the record does not determine one of the models: there is no score to compare")
@@ -314,9 +314,13 @@ class _Data:
     stretch: int
     """Rows of a window."""
     prior: Prior
+    autoregressive: bool = True
+    """Whether the noise may follow from itself, where the residuals demand it."""
 
     @cached_property
     def noise(self) -> Noise:
+        if not self.autoregressive:
+            return Noise() if self.filtered is None else Noise(np.asarray(self.filtered))
         return fit_noise(self.W, self.y, self.filtered, self.valid, self.stretch)
 
     @cached_property
@@ -392,9 +396,13 @@ class _Data:
             return None, [str(error)] * len(parts)
 
     def held_out(self) -> Numbers | None:
-        """Scores of the second half by the first, of which alone the noise is known as well."""
-        half = len(self.y) // 2
-        first, second = self.within(slice(half)), self.within(slice(half, None))
+        """Scores of the second half by the first.
+
+        The noise is the filters' alone: with an autoregression the torque just before would predict what the model does
+        not, and models that lack something would score as well as others.
+        """
+        half, plain = len(self.y) // 2, replace(self, autoregressive=False)
+        first, second = plain.within(slice(half)), plain.within(slice(half, None))
         try:
             samples = first.posterior().samples
         except ValueError:
