@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from jaximp.posterior import Posterior, PosteriorMany
@@ -108,6 +107,8 @@ def resume_chain(path: Path, fresh: Chain, evaluate: Callable[[Numbers], Numbers
 
 
 def _read_chain(path: Path) -> Chain:
+    import h5py
+
     with h5py.File(path, "r") as file:
         group = file[GROUP]
         state = [group.attrs[f"random_state_{k}"] for k in range(5)]
@@ -128,6 +129,8 @@ def _read_chain(path: Path) -> Chain:
 
 def write_chain(path: Path, chain: Chain) -> None:
     """Write a chain in emcee's layout, for `emcee.backends.HDFBackend`, with what a resumed run needs beside it."""
+    import h5py
+
     n, p = chain.start.shape
     whole, densities = chain.first(len(chain)) if chain.steps else (np.zeros((0, n, p)), np.zeros((0, n)))
     accepted = np.stack(chain.accepted) if chain.accepted else np.zeros((0, n))
