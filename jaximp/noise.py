@@ -380,7 +380,8 @@ def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArra
 
 def triangles(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"] | None = None) -> Numbers:
     """(n, p + 1, p + 1) of the rows; `corrected` where noise in the regressor moves an estimate, see `ATTENUATION`."""
-    if column_noise is None or (np.abs(attenuation(rows, column_noise)) <= ATTENUATION).all():
+    enough = rows.count.sum() > rows.W.shape[-1]
+    if column_noise is None or not enough or (np.abs(attenuation(rows, column_noise)) <= ATTENUATION).all():
         return rows.triangles()
     return corrected(rows, column_noise)
 

@@ -107,6 +107,16 @@ def test_draws_of_windows_that_cannot_be_trusted_are_not_believed() -> None:
     assert "no window can be trusted" in infer_recording(parse_job(JOB), nothing).why
 
 
+def test_windows_without_samples_are_left_out() -> None:
+    recording = joint()
+    valid = (TIME < 2.5) | (TIME > 4.5)
+    position, torque = (np.where(valid[:, None], x, np.nan) for x in (recording.position, recording.torque))
+    found = infer_recording(parse_job(JOB), replace(recording, position=position, torque=torque, valid=valid))
+    assert found.why == ""
+    assert [line for line in found.left_out if line.startswith("3 s: 0 independent rows")]
+    assert 3 not in found.start
+
+
 def test_joints_side_by_side_with_heavy_tails() -> None:
     soft, stiff = joint(), joint(stiffness=35.0)
     outliers = np.random.default_rng(3).random(stiff.torque.shape) < 0.005
