@@ -375,7 +375,8 @@ def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArra
     size = np.sqrt(np.diagonal(gram))
     size = np.where(size > 0, size, 1)
     inverse = np.linalg.pinv(gram / np.outer(size, size)) / np.outer(size, size)
-    return np.asarray(-(inverse @ lost @ theta) / np.sqrt(np.diagonal(inverse)))
+    stderr = np.sqrt(np.diagonal(inverse))
+    return np.asarray(-(inverse @ lost @ theta) / np.where(stderr > 0, stderr, 1))
 
 
 def triangles(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"] | None = None) -> Numbers:
