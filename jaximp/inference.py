@@ -20,9 +20,10 @@ from scipy.stats import chi2, norm
 from jaximp.identify import Prepared, in_windows, prepare
 from jaximp.impedance import ArmImpedance, identify_trials
 from jaximp.job import Job
-from jaximp.likelihood import Density, estimate_density, linear_density, noise_names, window_densities
+from jaximp.likelihood import Density, estimate_density, linear_density, noise_names, undetermined, window_densities
 from jaximp.models import Joints, Model, pathway_of
 from jaximp.noise import (
+    LAGS,
     Noise,
     Whiteness,
     WhiteRows,
@@ -107,8 +108,9 @@ class Inference:
         differences from the common mean, in standard deviations, are those of chi-squared where nothing changes
         (Cochran 1954). Noise that the residuals demand must not move the estimate (`noise.disagreement`).
         """
-        if self.whole.why or self.windows is None:
-            return self.whole.why
+        whole = self.summarised[0]
+        if whole.why or self.windows is None:
+            return whole.why
         if not self.verdicts.trusted.any():
             k = len(self.verdicts.reason) // 2
             return (
@@ -119,13 +121,14 @@ class Inference:
     @property
     def good(self) -> np.ndarray:
         """(M,) windows whose draws and whose verdict can be trusted."""
-        return np.zeros(0, bool) if self.windows is None else self.windows.ok & self.verdicts.trusted
+        windows = self.summarised[1]
+        return np.zeros(0, bool) if windows is None else windows.ok & self.verdicts.trusted
 
     def reason(self, k: int) -> str:
         """Why a window cannot be trusted, by its draws or by what else is known of it; empty where it can."""
-        assert self.windows is not None
-        verdict = self.verdicts.verdict[k]
-        return self.windows[k].why or ("" if verdict == TRUSTED else f"{verdict}, {self.verdicts.reason[k]}")
+        windows, verdict = self.summarised[1], self.verdicts.verdict[k]
+        assert windows is not None
+        return windows[k].why or ("" if verdict == TRUSTED else f"{verdict}, {self.verdicts.reason[k]}")
 
     @cached_property
     def summarised(self) -> tuple[Posterior, PosteriorMany | None]:
@@ -240,16 +243,24 @@ def infer_recording(
         left_out=tuple(f"{time[first]:.4g} s: {why}" for first, why in left_out),
         gains=_gains(data.model),
         noise=data.noise,
-        whiteness=tuple(whiteness(left[:, k], data.white.valid[:, k]) for k in range(left.shape[1])),
+        whiteness=tuple(_whiteness(data, left[:, k], k) for k in range(left.shape[1])),
         bias=data.bias,
-        shift=disagreement(data.W, data.y, data.noise, data.valid),
+        shift=disagreement(data.W, data.y, data.noise, data.valid, data.difference),
         held_out=data.held_out(),
         prior=prior_predictive(data.prior, data.W[data.valid], data.y[data.valid]),
         time=time,
         torque=np.where(data.valid.reshape(y.shape), y, np.nan),
-        bands=torque_bands(whole.samples, data.W, LEVELS).reshape(len(LEVELS), *y.shape),
+        bands=torque_bands(whole.samples, data.W, LEVELS, heavy_tails=job.posterior.heavy_tails).reshape(
+            len(LEVELS), *y.shape
+        ),
         notes=recording.notes,
     )
+
+
+def _whiteness(data: _Data, left: Numbers, k: int) -> Whiteness:
+    """Of an output's residuals, over more lags than its autoregression was fitted to."""
+    fitted = len(data.noise.autoregression[k]) if data.noise.autoregression else 0
+    return whiteness(left, data.white.valid[:, k], max(LAGS, fitted + 10) if fitted else None, fitted)
 
 
 def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
@@ -266,7 +277,8 @@ def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
 
 
 def _counted(scores: Numbers) -> Numbers:
-    return scores[np.isfinite(scores).all(axis=1)].sum(axis=1)
+    """Of every row in which some output counts."""
+    return np.nansum(scores[np.isfinite(scores).any(axis=1)], axis=1)
 
 
 def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[ArmImpedance, Posterior]:
@@ -354,6 +366,9 @@ class _Data:
 
     def _exact(self, rows: WhiteRows, key: jax.Array) -> Posterior:
         given, names, units = triangles(rows, self.column_noise)[0], self.model.names, self.model.units
+        why = undetermined(given[None], rows.count, make_prior((*names, *noise_names(1))))
+        if why:
+            raise ValueError(why)
         exact = exact_posterior(given, float(rows.count[0]), names, units)
         return exact.posterior(key, round(4 * self.job.posterior.ess))
 
@@ -401,7 +416,8 @@ class _Data:
         The noise is the filters' alone: with an autoregression the torque just before would predict what the model does
         not, and models that lack something would score as well as others.
         """
-        half, plain = len(self.y) // 2, replace(self, autoregressive=False)
+        counted = np.flatnonzero(self.valid.reshape(len(self.y), -1).any(axis=1))
+        half, plain = int(counted[len(counted) // 2]), replace(self, autoregressive=False)
         first, second = plain.within(slice(half)), plain.within(slice(half, None))
         try:
             samples = first.posterior().samples
@@ -409,7 +425,8 @@ class _Data:
             return None
         rows = whiten(second.W, second.y, first.noise, second.valid)
         heavy = self.job.posterior.heavy_tails
-        return np.where(rows.valid, log_scores(samples, rows, heavy_tails=heavy), np.nan)
+        scores = np.where(rows.valid, log_scores(samples, rows, heavy_tails=heavy), np.nan)
+        return scores if rows.valid.sum() > 1 else None
 
 
 @eqx.filter_jit
@@ -446,12 +463,15 @@ def _gains(model: Model) -> dict[str, Numbers]:
             pathway, tag = pathway_of(part), f"joint{j + 1}." if len(parts) > 1 else ""
             weights = [f"{tag}{column}" for column in pathway.columns]
             of_weights = np.array([column in weights for column in model.columns])
-            found[f"{tag}reflex_gain"] = np.where(of_weights, float(pathway.direction), 0.0)
+            named = model.names[int(np.argmax(of_weights))]  # of a weight, with the prefix of robot or human
+            prefix = named[: named.index("reflex_")]
+            found[f"{prefix}reflex_gain"] = np.where(of_weights, float(pathway.direction), 0.0)
     return found
 
 
 def _judged(job: Job, prepared: Prepared) -> tuple[Placement, Verdicts]:
     """Windows one behind the other, and what `identify` says of each."""
-    job = replace(job, window=replace(job.window, step=job.window.length))
+    once = replace(job.model, methods=job.model.methods and (1,))  # whose rows are those of the posterior
+    job = replace(job, model=once, window=replace(job.window, step=job.window.length))
     place = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters)
     return place, in_windows(job, prepared)[0].verdicts

@@ -33,6 +33,8 @@ RIDGE = 1e-8
 """Share of the largest spectral density that is added to all of it, so that the Cholesky factor exists."""
 LARGEST_BAND = 200_000_000
 """Numbers that a band matrix may have (1.6 GB)."""
+FEWEST = 3
+"""Rows of a stretch with parameters of its own, for each of them."""
 EXACT = 2000
 """Rows of a stretch up to which autoregressions are part of the covariance."""
 PIECE, OVERLAP = 6, 4
@@ -193,7 +195,8 @@ def fit_noise(
 def _residuals_by_stretch(rows: WhiteRows, noise: Noise, length: int) -> tuple[Numbers, Numbers]:
     """(R, n) residuals of the optimum of every stretch, and (R, n, p) what it took from the noise."""
     predicted, left, lost = _predicted(rows, noise), np.zeros_like(rows.y), np.zeros_like(rows.W)
-    starts = range(0, max(1, len(rows.y) - length // 2), length)
+    length = max(length, FEWEST * rows.W.shape[-1])
+    starts = range(0, max(1, len(rows.y) - length + 1), length)
     for first, last in zip(starts, (*starts[1:], len(rows.y)), strict=True):
         part = slice(first, last)
         theta, root = _optimum_and_root(_rows_of(predicted, part))
@@ -328,11 +331,13 @@ def disagreement(
     y: Num[AnyArray, "S *n"],
     noise: Noise,
     valid: Shaped[AnyArray, "S *n"] | None = None,
+    difference: Num[AnyArray, "S *n p"] | None = None,
 ) -> Numbers:
     """(p,) by how many standard errors of the difference the optimum moves with the autoregressions.
 
-    Arguments as for `whiten`. Both estimates are right where the model is, and weigh frequencies differently; what they
-    disagree about is no noise, but something that the model lacks. Zero without autoregressions.
+    Arguments as for `whiten`, and of `difference` as for `whitened_covariance`: how far noise of the regressor may move
+    either optimum is no disagreement. Both estimates are right where the model is, and weigh frequencies differently;
+    what they disagree about is no noise, but something that the model lacks. Zero without autoregressions.
 
     **Source:** Hausman 1978; the optimum without them has the covariance `inv(M) W' C W inv(M)`, with M = W'W and the
     covariance C of the noise (White 1980).
@@ -359,7 +364,17 @@ def disagreement(
     inverse, ideal = (np.linalg.pinv(one, hermitian=True) for one in (M, M_better))
     variance, least = np.diagonal(inverse @ middle @ inverse), np.diagonal(ideal)
     apart = np.sqrt(np.maximum(variance - least, 0.01 * least))
-    return np.asarray((theta - better) * unit / np.where(apart > 0, apart, 1))
+    moved = (theta - better) * unit
+    if difference is not None:
+        plain = whitened_covariance(difference, replace(noise, autoregression=()), valid)
+        biases = (
+            attenuation(rows, plain) * np.sqrt(np.diagonal(inverse)),
+            attenuation(predicted, whitened_covariance(difference, noise, valid)) * np.sqrt(least),
+        )
+        # The bias is known to first order: what is left of it may be as large as a part of it.
+        moved = moved - (biases[0] - biases[1])
+        apart = apart + 0.5 * (np.abs(biases[0]) + np.abs(biases[1]))
+    return np.asarray(moved / np.where(apart > 0, apart, 1))
 
 
 def attenuation(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray, "*n p p"]) -> Numbers:
@@ -400,7 +415,7 @@ def corrected(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray,
     **Source:** Fuller 1987, section 2.2.
     """
     n, p = len(rows.count), rows.W.shape[-1]
-    out = []
+    out: list[Numbers] = []
     for k, (sigma, count) in enumerate(zip(_covariances(column_noise, n, p), rows.count, strict=True)):
         size = np.linalg.norm(rows.W[:, k], axis=0)
         size = np.where(size > 0, size, 1)
@@ -411,6 +426,9 @@ def corrected(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray,
                 "the noise of the motion is as large as the motion in some direction of the regressor: excite more, or "
                 "lower filter.position_cutoff"
             )
+        if not (y @ y > 0):  # no row of this output counts
+            out.append(np.zeros((p + 1, p + 1)))
+            continue
         theta = np.linalg.pinv(M, hermitian=True) @ W.T @ y  # an output need not depend on every parameter
         left = y - W @ theta
         lost = error @ theta
@@ -418,7 +436,7 @@ def corrected(rows: WhiteRows, column_noise: Num[AnyArray, " p"] | Num[AnyArray,
         values, vectors = np.linalg.eigh(M @ np.linalg.pinv(spread, hermitian=True) @ M)
         root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
         below = np.append(np.zeros(p), np.linalg.norm(left))
-        out.append(np.linalg.qr(np.vstack([np.column_stack([root * size, root @ theta]), below]), mode="r"))
+        out.append(np.asarray(np.linalg.qr(np.vstack([np.column_stack([root * size, root @ theta]), below]), mode="r")))
     return np.stack(out)
 
 
@@ -435,7 +453,8 @@ def _optimum_and_root(rows: WhiteRows) -> tuple[Numbers, Numbers]:
     columns = (rows.W / scale[:, None]).reshape(-1, len(theta))
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1)
-    return theta, np.linalg.pinv(np.linalg.qr(columns / size, mode="r")) / size[:, None]
+    below = np.zeros((max(0, len(size) - len(columns)), len(size)))
+    return theta, np.linalg.pinv(np.linalg.qr(np.vstack([columns / size, below]), mode="r")) / size[:, None]
 
 
 def _covariances(column_noise: AnyArray, n: int, p: int) -> Numbers:

@@ -70,21 +70,24 @@ def torque_bands(
     levels: Sequence[float] = (0.025, 0.25, 0.5, 0.75, 0.975),
     *,
     noise: bool = True,
+    heavy_tails: bool | float = False,
     seed: int = 0,
 ) -> Numbers:
     """(levels, S, *n) quantiles of the torque [N m] that samples predict for a motion, row by row.
 
-    **Arguments:** `W` rows that are not whitened; `noise` adds the noise of a row, for bands that hold so much of the
-    measured torque. (Of one row: neighbouring rows share their noise, which the bands do not show.)
+    **Arguments:** `W` rows that are not whitened; `heavy_tails` as for the density; `noise` adds that of a row, for
+    bands that hold so much of the measured torque. (Of one row: neighbouring rows share their noise, which the bands do
+    not show.)
     """
     W, samples = np.asarray(W, float), np.asarray(samples, float)
     p, generator = W.shape[-1], np.random.default_rng(seed)
     shape, out = W.shape[:-1], []
-    scale = np.exp(samples[:, p:])
+    scale, nu = np.exp(samples[:, p:]), NU if heavy_tails is True else float(heavy_tails)
     for first in range(0, shape[0], 1000):
         torque = W[first : first + 1000] @ samples[:, :p].T
         if noise:
-            torque = torque + (scale[:, 0] if W.ndim == 2 else scale.T) * generator.normal(size=torque.shape)
+            drawn = generator.standard_t(nu, torque.shape) if nu else generator.normal(size=torque.shape)
+            torque = torque + (scale[:, 0] if W.ndim == 2 else scale.T) * drawn
         out.append(np.quantile(torque, levels, axis=-1))
     return np.concatenate(out, axis=1)
 

@@ -80,6 +80,7 @@ def test_noise_of_the_position_is_corrected_for() -> None:
     noise = np.random.default_rng(1).normal(0, 1e-3, recording.position.shape)
     found = infer_recording(parse_job(JOB), replace(recording, position=recording.position + noise))
     assert found.bias[0] < -0.25
+    assert found.why == ""
     z = (found.whole.mean[:4] - list(TRUTH.values())) / found.whole.samples.std(axis=0)[:4]
     assert np.abs(z).max() < 4
     assert found.whole.samples[:, 0].std() < 1e-3
