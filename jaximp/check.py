@@ -12,7 +12,7 @@ from jaximp import signals
 from jaximp.identify import Estimates, identify_recording, jump_note
 from jaximp.job import Job
 from jaximp.models import combine
-from jaximp.regression import design_filters, regress
+from jaximp.regression import design_filters, jumped, regress
 from jaximp.trust import NEGATIVE, NO_DATA, WEAK
 from jaximp.types import Progress, Recording
 
@@ -155,7 +155,7 @@ def _range(label: str, joint: str, x: NDArray[np.float64]) -> list[Finding]:
 
 def _gaps(recording: Recording) -> Finding:
     missing = 1 - recording.valid.mean()
-    text = [f"{missing:.2%} of the samples are missing" if missing else "none", jump_note(recording)]
+    text = [f"{missing:.2%} of the samples are missing" if missing else "none", jump_note(recording, jumped(recording))]
     verdict = BAD if missing > 0.05 else LOOK if missing or text[1] else GOOD
     return Finding("gaps", verdict, "; ".join(filter(None, text)))
 

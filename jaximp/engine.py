@@ -73,6 +73,8 @@ class Plan(NamedTuple):
     """Whether rows have weights: then they are not their own count."""
     lags: int = 0
     """Lags of the noise's autocovariance, none for white noise; a window has at least `2 reach` rows."""
+    ahead: int = 0
+    """Windows from one to that which it is held against (`Unseen`); none if nothing is to be predicted."""
 
     @property
     def reach(self) -> int:
@@ -110,6 +112,7 @@ class ChunkFit(NamedTuple):
     share: Array
     """(K,) what the other columns leave of the one that they imitate best, squared and in the chunk's coordinates."""
     statistics: Statistics | None = None
+    unseen: Unseen | None = None
 
     @property
     def doubtful(self) -> Any:
@@ -133,6 +136,15 @@ class Statistics(NamedTuple):
     samples: Array
 
 
+class Unseen(NamedTuple):
+    """How well each window predicts the one `plan.ahead` windows on; (K,), nothing where that is beyond the chunk."""
+
+    vaf: Array
+    samples: Array
+    variance: Array
+    """Of the torque there."""
+
+
 def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, noise: Array | None = None) -> ChunkFit:
     """Fit every window of a chunk.
 
@@ -151,11 +163,13 @@ def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, n
         ends = around(0), around(window)
     first = _first_windows(blocked, plan, window, count)
 
-    def solve(sums: Rows, peak: Array, shift: Array | int) -> ChunkFit:
+    def solve(sums: Rows, peak: Array, shift: Array | int) -> tuple[ChunkFit, Array]:
         across = None if ends is None or noise is None else _across(ends, plan, shift, noise, p)
-        return _solve(plan, p, R, sums, peak, noise, across)
+        return _solve(plan, p, R, sums, peak, noise, across), _for_prediction(sums, p, plan)
 
-    def advance(state: tuple[Rows, Array], step: tuple[Array, Array, Array]) -> tuple[tuple[Rows, Array], ChunkFit]:
+    def advance(
+        state: tuple[Rows, Array], step: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Rows, Array], tuple[ChunkFit, Array]]:
         sums, peak = state
         leaving, entering, shift = keep(step)
         found = solve(sums, peak, shift)
@@ -166,13 +180,13 @@ def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, n
 
     state = first, _diagonal(first, p)
     if plan.per_block == 1:
-        found = jax.tree.map(lambda x: x[None], solve(*state, 0))
-        return _in_given_units(found, R, plan)
+        found, later = jax.tree.map(lambda x: x[None], solve(*state, 0))
+        return _in_given_units(_with_unseen(found, later, R, plan), R, plan)
     leaving, entering = (
         x[:, :, : plan.lanes].reshape(plan.per_block, plan.step, len(features), plan.lanes) for x in (blocked, tail)
     )
-    found = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
-    return _in_given_units(found, R, plan)
+    found, later = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
+    return _in_given_units(_with_unseen(found, later, R, plan), R, plan)
 
 
 class Wanted(NamedTuple):
@@ -447,7 +461,8 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
     share = (pivots**2 / jnp.where(peak > 0, peak, 1)).min(axis=0)
     if not plan.statistics:
         return ChunkFit(theta, solvable, share)
-    rss, vaf, weight, samples = _residuals(plan, triangle, inner, R, sums)
+    rss = (R[p, p] * triangle[p][0]) ** 2
+    weight, vaf, _, samples = _residuals(plan, rss, inner, R, sums)
     constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
     own_inverse, given, inverse = _triangle_and_inverses(constant, R[:p, :p])
     sigma_max, sigma_min = _extreme_singular_values(given, inverse)
@@ -510,15 +525,52 @@ def _in_given_units(found: ChunkFit, R: Array, plan: Plan) -> ChunkFit:
             rest = rest - R[i, k] * theta[k]
         theta[i] = keep(rest / R[i, i])
     found = found._replace(theta=jnp.stack(theta, axis=1))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1]), found)
+    return jax.tree.map(lambda x: _one_after_another(x, plan), found)
 
 
-def _residuals(
-    plan: Plan, triangle: Rows, inner: list[Array], R: Array, sums: Rows
-) -> tuple[Array, Array, Array, Array]:
-    """Sum of squares, variance accounted for, sum of the weights, and how many samples counted."""
+def _one_after_another(x: Array, plan: Plan) -> Array:
+    """(windows of a block, ..., blocks) -> (windows, ...)"""
+    return jnp.moveaxis(x, (-1, 0), (0, 1)).reshape(plan.windows, *x.shape[1:-1])
+
+
+def _for_prediction(sums: Rows, p: int, plan: Plan) -> Array:
+    """The sums by which other parameters are held against a window, (k, lanes)."""
+    if not plan.ahead:
+        return jnp.zeros((0, sums[0].shape[-1]), sums[0].dtype)
+    return keep(jnp.concatenate(sums[: p + 2 + plan.outputs + plan.weighted]))
+
+
+def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan) -> ChunkFit:
+    """Hold every window's parameters, in the chunk's coordinates, against the sums of a later one."""
+    p = len(R) - 1
+    if not plan.ahead:
+        return found
+    assert plan.statistics
+    sizes = [*range(p + 1, 0, -1), 1, *[p + 2 + plan.outputs] * plan.outputs, *[1] * plan.weighted]
+    later = jnp.roll(_one_after_another(sums, plan), -plan.ahead, axis=0).T
+    rows = tuple(jnp.split(keep(later), np.cumsum(sizes)[:-1]))
+    inner = list(keep(_one_after_another(found.theta, plan).T))
+    # The residual is this combination of the chunk's columns; its sum of squares, a quadratic form of theirs.
+    along = [*(-theta for theta in inner), jnp.ones_like(inner[0])]
+    square = _total(
+        along[i] * ((1 if i == k else 2) * along[k]) * row[k - i]
+        for i, row in enumerate(rows[: p + 1])
+        for k in range(i, p + 1)
+    )
+    rss = R[p, p] ** 2 * jnp.maximum(square, 0)
+    _, vaf, total, samples = _residuals(plan, rss, inner, R, rows)
+    whole = jnp.arange(plan.windows) < plan.windows - plan.ahead
+    unseen = Unseen(jnp.where(whole, vaf, jnp.nan), jnp.where(whole, samples, 0), total / jnp.maximum(samples, 1))
+    back = tuple(x.reshape(plan.lanes, plan.per_block).T for x in unseen)
+    return found._replace(unseen=Unseen(*back))
+
+
+def _residuals(plan: Plan, rss: Array, inner: list[Array], R: Array, sums: Rows) -> tuple[Array, Array, Array, Array]:
+    """Sum of the weights, variance accounted for, the torque's squares about its mean, and how many samples counted.
+
+    Of parameters `inner`, in the chunk's coordinates, which leave `rss`, the sum of squared residuals.
+    """
     p, members = len(inner), sums[len(inner) + 2 :]
-    rss = (R[p, p] * triangle[p][0]) ** 2
     total, left, whole = sums[p + 1][0], rss, jnp.zeros_like(rss)
     for output, row in enumerate(members[: plan.outputs]):
         weight = row[p + 2 + output]
@@ -526,7 +578,8 @@ def _residuals(
         over = 1 / jnp.where(weight > 0, weight, 1)
         total, left, whole = total - row[p + 1] ** 2 * over, left - residual**2 * over, whole + weight
     samples = members[plan.outputs][0] if plan.weighted else whole
-    return rss, jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan), whole, samples
+    vaf = jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1), jnp.nan)
+    return whole, vaf, total, samples
 
 
 def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Array]:

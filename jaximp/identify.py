@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ from jaximp.regression import (
 )
 from jaximp.trust import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest
-from jaximp.windows import score, sliding_least_squares
+from jaximp.windows import Score, score, sliding_least_squares
 
 CLEAR = 2.0
 """A reflex whose gain is so many standard errors from zero has a delay."""
@@ -168,6 +168,14 @@ class _Pair:
     loaded: Regression
 
 
+class Solved(NamedTuple):
+    """What is found in the windows before it is judged."""
+
+    fit: SlidingFit
+    unseen: Score
+    """How well each window's parameters predict the torque of the window behind it."""
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A filtered recording: what windows of any length share (but for filters inside every window)."""
@@ -183,27 +191,36 @@ class Prepared:
     """(p,) what noise of the position leaves in each column."""
     pair: _Pair | None
     reference: ReferenceMotion
+    jumps: NDArray[np.bool_]
+    """(N,) where the position jumps."""
+    solved: tuple[Solved, ...] = ()
+    """One for each joint (of joints side by side), where the windows are solved already, many recordings at a time."""
 
 
 def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
     """Filter the recordings of a job."""
-    signals.require_float64(recording.position)
-    check_window(job, recording)
-    robot, human = job.models(recording.joints, recording.sample_rate)
-    filters = design_filters(job.filter, recording.sample_rate)
+    robot, human, filters = checked_models(job, recording)
     noise = noise_of_rows(job, recording, filters)
     model = robot if human is None else human
     assert model is not None
-    if job.model.arm is not None:
-        _check_elbow(job, recording)
     if robot is None or human is None:
         rows, pair = regress(model, recording, job, filters), None
     else:
         rows, pair = _prepare_pair(job, recording, alone, robot, human, filters)
     return Prepared(
         recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair,
-        _reference(job, recording),
+        reference_motion(job, recording), jumped(recording),
     )  # fmt: skip
+
+
+def checked_models(job: Job, recording: Recording) -> tuple[Model | None, Model | None, Filters]:
+    """Robot's and human's model and the filters, for a recording that suits the job."""
+    signals.require_float64(recording.position)
+    check_window(job, recording)
+    robot, human = job.models(recording.joints, recording.sample_rate)
+    if job.model.arm is not None:
+        _check_elbow(job, recording)
+    return robot, human, design_filters(job.filter, recording.sample_rate)
 
 
 def _check_elbow(job: Job, recording: Recording) -> None:
@@ -217,16 +234,23 @@ def _check_elbow(job: Job, recording: Recording) -> None:
 
 
 def in_windows(
-    job: Job, prepared: Prepared, progress: Progress = lambda share: None, longest: float | None = None
+    job: Job,
+    prepared: Prepared,
+    progress: Progress = lambda share: None,
+    longest: float | None = None,
+    curves: bool = True,
 ) -> list[Estimates]:
-    """Solve and judge every window of a prepared recording, by every method that the job asks for.
+    """Solve (where that is not done yet) and judge every window of a prepared recording, by every method of the job.
 
-    **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code.
+    **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code;
+    `curves` whether the torques over time are wanted, which only figures need.
     """
     if isinstance(prepared.model, Joints):
-        return [_joint_by_joint(job, prepared, progress, longest)]
+        return [_joint_by_joint(job, prepared, progress, longest, curves)]
     rows, noise = prepared.rows, prepared.noise
     place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
+    if prepared.solved:
+        return [_estimates(job, prepared, rows, prepared.solved[0], place, curves=curves)]
     if prepared.pair is None:
         valid = jnp.asarray(rows.valid)
 
@@ -237,7 +261,7 @@ def in_windows(
 
         fit = solve(rows.W)
         gain = solve(with_gain(prepared.model, rows.W)) if prepared.model.memory else None
-        return [_estimates(job, prepared, rows, fit, place, gain=gain)]
+        return [_estimates(job, prepared, rows, _predict(rows, fit, place), place, gain=gain, curves=curves)]
     pair = prepared.pair
     merge = combine(pair.robot, prepared.model).merge
     results = []
@@ -252,15 +276,15 @@ def in_windows(
             gain = solve_pair(alone, loaded).fit
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
-        estimates = _estimates(
-            job, prepared, human, found.fit, place, method, METHODS[method], found.warning, gain=gain
-        )
+        solved = _predict(human, found.fit, place)
+        notes = (METHODS[method], found.warning)
+        estimates = _estimates(job, prepared, human, solved, place, method, *notes, gain=gain, curves=curves)
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(job.model.methods))
     return results
 
 
-def _joint_by_joint(job: Job, prepared: Prepared, progress: Progress, longest: float | None) -> Estimates:
+def _joint_by_joint(job: Job, prepared: Prepared, progress: Progress, longest: float | None, curves: bool) -> Estimates:
     """Joints side by side share no parameter and no noise: each is solved and judged by itself."""
     assert isinstance(prepared.model, Joints)
     for name in job.trust.parameters:
@@ -273,7 +297,8 @@ def _joint_by_joint(job: Job, prepared: Prepared, progress: Progress, longest: f
         tag = f"joint{j + 1}."
         chosen = tuple(name.removeprefix(tag) for name in job.trust.parameters if name.startswith(tag))
         alone = replace(job, trust=replace(job.trust, parameters=chosen))
-        parts.append(in_windows(alone, _one_joint(prepared, j, model, columns), longest=longest)[0])
+        one = _one_joint(prepared, j, model, columns)
+        parts.append(in_windows(alone, one, longest=longest, curves=curves)[0])
         first = columns.stop
         progress((j + 1) / len(prepared.model.models))
     return _side_by_side(prepared.model, parts)
@@ -294,6 +319,7 @@ def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prep
         rows=Rows(rows.W[:, j, columns], rows.torque[:, j], rows.valid[:, j], rows.time),
         column_noise=prepared.column_noise[columns],
         reference=_of_joint(prepared.reference, this),
+        solved=prepared.solved[this],
     )
 
 
@@ -417,25 +443,33 @@ def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
     return alone
 
 
+def _predict(rows: Rows, fit: SlidingFit, place: Placement) -> Solved:
+    """Hold every window's parameters against the window behind it."""
+    ahead = place.next_starts[: len(fit.last)]
+    valid = jnp.asarray(rows.valid)
+    return Solved(fit, score(rows.W, rows.torque, valid, fit.theta, ahead, place.window, place.step, place.room))
+
+
 def _estimates(
     job: Job,
     prepared: Prepared,
     rows: Rows,
-    fit: SlidingFit,
+    solved: Solved,
     place: Placement,
     method: int | None = None,
     *notes: str,
     gain: SlidingFit | None = None,
+    curves: bool = True,
 ) -> Estimates:
-    """Judge the windows of a fit and predict what they have not seen. `gain`: the fit that `with_gain` makes."""
+    """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
     recording, model = prepared.recording, prepared.model
-    starts, ahead = place.starts[: len(fit.last)], place.next_starts[: len(fit.last)]
-    against = partial(score, rows.W, rows.torque, jnp.asarray(rows.valid), fit.theta)
-    unseen = against(ahead, place.window, place.step, place.room)
+    fit, unseen = solved
+    starts = place.starts[: len(fit.last)]
     usual = np.asarray(rows.torque)[np.asarray(rows.valid)].var()
     held_out = np.where(np.asarray(unseen.variance) > STILL * usual, np.asarray(unseen.vaf), np.nan)
     if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
-        seen = against(starts, place.window, place.step, place.room)
+        valid = jnp.asarray(rows.valid)
+        seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, place.room)
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
     threshold, why_not = _threshold(job, prepared, place, method)
@@ -453,7 +487,8 @@ def _estimates(
         threshold,
         limits,
     )
-    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place)
+    jumps = jump_note(recording, prepared.jumps)
+    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     measured = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
     return Estimates(
         names=model.names,
@@ -471,7 +506,7 @@ def _estimates(
         predicted=predicted,
         notes=(
             *recording.notes,
-            *filter(None, (jump_note(recording), _literal_note(job), why_not, *notes)),
+            *filter(None, (jumps, _literal_note(job), why_not, *notes)),
             *(_reflex_note(reflex, verdicts.trusted) for reflex in reflexes),
         ),
         reflexes=reflexes,
@@ -500,9 +535,9 @@ def _reflex_note(reflex: Reflex, trusted: NDArray[np.bool_]) -> str:
     return note
 
 
-def jump_note(recording: Recording) -> str:
+def jump_note(recording: Recording, jumps: NDArray[np.bool_]) -> str:
     """Where the position jumps, for people; empty where it does not."""
-    at = recording.time[jumped(recording)]
+    at = recording.time[jumps]
     if not len(at):
         return ""
     where = ", ".join(f"{t:.6g} s" for t in at[::2][:5]) + (", ..." if len(at) > 10 else "")
@@ -533,10 +568,10 @@ def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | Non
     rate = prepared.recording.sample_rate
     W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))
     window = round(job.window.length * rate * place.counted / place.window)
-    return float(fake_change_threshold(W, len(q), window)), ""
+    return float(fake_change_threshold(np.asarray(W), len(q), window)), ""
 
 
-def _reference(job: Job, recording: Recording) -> ReferenceMotion:
+def reference_motion(job: Job, recording: Recording) -> ReferenceMotion:
     """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
     rate, series = recording.sample_rate, job.load_design()
     if series is not None:
@@ -565,11 +600,14 @@ def _parameter_scale(rows: Rows) -> NDArray[np.float64]:
 
 
 def _reconstruct(
-    rows: Rows, fit: SlidingFit, starts: NDArray[np.int64], place: Placement
+    rows: Rows, fit: SlidingFit, starts: NDArray[np.int64], place: Placement, wanted: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """The model's torque with seen and unseen parameters, and which rows it is shown for."""
     W, theta = np.asarray(rows.W), np.asarray(fit.theta)
     times, window = rows.time, place.window
+    if not wanted:
+        none = np.empty((0, int(np.prod(W.shape[1:-1]))))
+        return none, none, np.empty(0, np.int64)
     if place.separate:  # windows hold copies of the same samples: show each sample once, from non-overlapping windows
         chosen, end = [], -np.inf
         for k, first in enumerate(starts):

@@ -6,9 +6,11 @@ writes, inside every window, whose rows then stand one block after another.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,7 +48,7 @@ class Filters:
     @property
     def reach(self) -> int:
         """Samples beside an end or a gap that the filters spoil."""
-        return sum(signals.reach(sos) for sos in (self.position, self.parallel) if sos is not None)
+        return _reach_of(self, 0.01)
 
     @property
     def bridge(self) -> int:
@@ -56,12 +58,23 @@ class Filters:
     @property
     def ringing(self) -> int:
         """Samples beside a jump of the position until the filters' answer to it has died out."""
-        return sum(signals.reach(sos, 1e-6) for sos in (self.position, self.parallel) if sos is not None)
+        return _reach_of(self, 1e-6)
 
     @property
     def noise(self) -> NDArray[np.float64] | None:
         """Autocovariance by lag, in rows, of white torque noise after the filters."""
-        return None if self.parallel is None else signals.autocovariance(self.parallel, self.decimate)
+        return None if self.parallel is None else _autocovariance(self)
+
+
+@lru_cache(maxsize=64)
+def _reach_of(filters: Filters, share: float) -> int:
+    return sum(signals.reach(sos, share) for sos in (filters.position, filters.parallel) if sos is not None)
+
+
+@lru_cache(maxsize=64)
+def _autocovariance(filters: Filters) -> NDArray[np.float64]:
+    assert filters.parallel is not None
+    return signals.autocovariance(filters.parallel, filters.decimate)
 
 
 @dataclass(frozen=True)
@@ -74,6 +87,23 @@ class Rows:
     time: NDArray[np.float64]
 
 
+class Motion(NamedTuple):
+    """What a recording measured, with straight lines across its gaps."""
+
+    position: NDArray[np.float64]
+    """(N, n)"""
+    torque: NDArray[np.float64]
+    """(N, n)"""
+    velocity: NDArray[np.float64] | None = None
+    """(N, n) where it is to serve in place of a derivative, and the acceleration too."""
+    acceleration: NDArray[np.float64] | None = None
+
+    @property
+    def derivatives(self) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+        return self.velocity, self.acceleration
+
+
+@lru_cache(maxsize=64)
 def design_filters(settings: FilterSettings, sample_rate: float) -> Filters:
     """Butterworth filters for a recording of this sample rate [Hz]."""
     parallel = [
@@ -102,13 +132,24 @@ def _plain(sos: NDArray[np.float64] | None) -> signals.Sections | None:
 def regress(model: Model, recording: Recording, job: Job, filters: Filters) -> Rows:
     """Filter a recording and evaluate the model on it, once or inside every window, as the job says."""
     _check_memory(model, recording, job)
-    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
-    derivatives = _measured_derivatives(job.filter, recording)
+    motion = measured_motion(job.filter, recording)
     if job.filter.mode == "window":
-        return _regress_in_windows(model, recording, job, filters, q, torque)
-    W, y, speed = filtered(model, filters, recording.sample_rate, q, torque, derivatives)
-    valid = undisturbed(recording, filters, memory=model.memory)[:: filters.decimate]
+        return _regress_in_windows(model, recording, job, filters, motion.position, motion.torque)
+    W, y, speed = filtered(model, filters, recording.sample_rate, motion.position, motion.torque, motion.derivatives)
     moving = np.asarray(speed) >= job.window.min_velocity
+    return rows_of(recording, filters, W, y, undisturbed(recording, filters, memory=model.memory), moving)
+
+
+def rows_of(
+    recording: Recording,
+    filters: Filters,
+    W: AnyArray,
+    y: AnyArray,
+    clean: NDArray[np.bool_],
+    moving: NDArray[np.bool_],
+) -> Rows:
+    """What was filtered in one go, and which of its rows count: `clean` (N,) samples (`undisturbed`), `moving` rows."""
+    valid = clean[:: filters.decimate]
     valid = valid & moving if recording.n_joints == 1 else valid[:, None] & moving
     if not valid.any():
         raise ValueError(
@@ -140,17 +181,24 @@ def jumped(recording: Recording) -> NDArray[np.bool_]:
     return np.any([signals.jumps(q) for q in recording.position.T], axis=0)
 
 
-def undisturbed(recording: Recording, filters: Filters, ends: bool = True, memory: int = 0) -> NDArray[np.bool_]:
+def undisturbed(
+    recording: Recording,
+    filters: Filters,
+    ends: bool = True,
+    memory: int = 0,
+    jumps: NDArray[np.bool_] | None = None,
+) -> NDArray[np.bool_]:
     """(N,) samples whose filtered value comes from measurements, and not from a gap, a jump or (`ends`) an end.
 
     A gap that is short against the filters is bridged: the straight line across it is as good as a measurement. What a
-    gap, a jump or the beginning spoils, a model with a `memory` of so many samples remembers.
+    gap, a jump or the beginning spoils, a model with a `memory` of so many samples remembers. `jumps` is what `jumped`
+    finds, where that is known.
     """
     missing = signals.long_gaps(recording.valid, filters.bridge)
     known = signals.lengthen_gaps(~missing, memory)
     known[: memory if ends else 0] = False
     valid = signals.widen_gaps(known, filters.reach, ends)
-    jumps = jumped(recording)
+    jumps = jumped(recording) if jumps is None else jumps
     if not jumps.any():
         return valid
     return valid & signals.widen_gaps(signals.lengthen_gaps(~jumps, memory), filters.ringing, ends=False)
@@ -167,14 +215,31 @@ def filtered(
 ) -> tuple[Array, Array, Array]:
     """Regressor, torque and speed of one stretch of samples: parallel filters, then every n-th sample."""
 
-    def smooth(x: AnyArray) -> Array:
-        return jnp.asarray(x) if filters.position is None else signals.filter_zero_phase(filters.position, x)
+    def filtered_by(sos: signals.Sections | None) -> Callable[[AnyArray], Array]:
+        return jnp.asarray if sos is None else partial(signals.filter_zero_phase, sos)
 
+    passes = filtered_by(filters.position), filtered_by(filters.parallel)
+    return columns_of(
+        model, passes, lambda x: signals.central_differences(x, sample_rate), filters.decimate, q, torque, derivatives
+    )
+
+
+def columns_of(
+    model: Model,
+    passes: tuple[Callable[[AnyArray], Array], Callable[[AnyArray], Array]],
+    differences: Callable[[AnyArray], tuple[Array, Array]],
+    decimate: int,
+    q: AnyArray,
+    torque: AnyArray,
+    derivatives: tuple[AnyArray | None, AnyArray | None],
+) -> tuple[Array, Array, Array]:
+    """Regressor, torque and speed by given filters (of the position; of all columns) and differences."""
+    smooth, parallel = passes
     q = smooth(q)
-    dq, ddq = signals.central_differences(q, sample_rate)
+    dq, ddq = differences(q)
     if derivatives[0] is not None:
         dq = smooth(derivatives[0])
-        ddq = signals.central_differences(dq, sample_rate)[0]
+        ddq = differences(dq)[0]
     if derivatives[1] is not None:
         ddq = smooth(derivatives[1])
     one_joint = q.shape[1] == 1
@@ -183,12 +248,8 @@ def filtered(
     if model.memory:  # the filters need numbers; `undisturbed` lets none of these count
         W = W.at[: model.memory].set(jnp.nan_to_num(W[: model.memory]))
     y = jnp.asarray(torque)[:, 0] if one_joint else jnp.asarray(torque)
-    if filters.parallel is not None:
-        both = jnp.concatenate([W, y[..., None]], axis=-1)
-        both = signals.filter_zero_phase(filters.parallel, both)
-        W, y = both[..., :-1], both[..., -1]
-    n = filters.decimate
-    return W[::n], y[::n], jnp.abs(motion[1])[::n]
+    both = parallel(jnp.concatenate([W, y[..., None]], axis=-1))
+    return both[::decimate, ..., :-1], both[::decimate, ..., -1], jnp.abs(motion[1])[::decimate]
 
 
 def _regress_in_windows(
@@ -336,19 +397,20 @@ def _away_from_ends(window: int, filters: Filters, settings: FilterSettings) -> 
     return (kept >= edge) & (kept < window - edge)
 
 
-def _measured_derivatives(
-    settings: FilterSettings, recording: Recording
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+def measured_motion(settings: FilterSettings, recording: Recording) -> Motion:
+    """What goes into the filters; the velocity only where the settings ask for it."""
+    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
     if not settings.measured_derivatives:
-        return None, None
+        return Motion(q, torque)
     if recording.velocity is None:
         raise ValueError("filter.measured_derivatives needs a velocity column in [recording]")
     if settings.mode == "window":
         raise ValueError("filter.measured_derivatives works with filter.mode = 'once'")
-    acceleration = recording.acceleration
-    return signals.fill_gaps(recording.velocity, recording.valid), (
-        None if acceleration is None else signals.fill_gaps(acceleration, recording.valid)
+    velocity, acceleration = (
+        None if x is None else signals.fill_gaps(x, recording.valid)
+        for x in (recording.velocity, recording.acceleration)
     )
+    return Motion(q, torque, velocity, acceleration)
 
 
 def step_seconds(job: Job) -> float:
@@ -426,23 +488,40 @@ def column_noise(model: Model, recording: Recording, job: Job, filters: Filters)
 
 
 def noisy_columns(model: Model, recording: Recording, job: Job, filters: Filters) -> NDArray[np.float64]:
-    """(N, *n, p) what noise of the motion leaves in each column: the pipeline, run with noise as well.
+    """(N, *n, p) what noise of the motion leaves in each column: the pipeline, run with noise as well."""
+    motion = measured_motion(job.filter, recording)
+    noisy, rate = with_noise(motion), recording.sample_rate
+    plain = np.asarray(filtered(model, filters, rate, motion.position, motion.torque, motion.derivatives)[0])
+    spoilt = np.asarray(filtered(model, filters, rate, noisy.position, noisy.torque, noisy.derivatives)[0])
+    return without_jumps(model, spoilt - plain)
 
-    The columns that jump (the sign of the velocity) are left out: the jumps say nothing of the joint's excitation.
-    """
-    generator = np.random.default_rng(0)
 
-    def with_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return x + np.stack([generator.normal(0, signals.noise_level(column), len(x)) for column in x.T], axis=1)
+def without_jumps(model: Model, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Zero for the columns that jump (the sign of the velocity), which say nothing of the joint's excitation."""
+    return np.where(["sign" not in column for column in model.columns], noise, 0.0)
 
-    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
-    velocity, acceleration = _measured_derivatives(job.filter, recording)
-    noisy_motion = (
-        None if velocity is None else with_noise(velocity),
-        None if acceleration is None else with_noise(acceleration),
-    )
-    rate = recording.sample_rate
-    plain = np.asarray(filtered(model, filters, rate, q, torque, (velocity, acceleration))[0])
-    noisy = np.asarray(filtered(model, filters, rate, with_noise(q), torque, noisy_motion)[0])
-    smooth = np.array(["sign" not in column for column in model.columns])
-    return np.where(smooth, noisy - plain, 0.0)
+
+def with_noise(motion: Motion, levels: Sequence[float] | None = None) -> Motion:
+    """The motion with as much noise again as is in it; `levels` of the positions' noise, where they are known."""
+    moving = [motion.velocity, motion.acceleration, motion.position]
+    numbers = _normal_numbers(sum(x.size for x in moving if x is not None))
+    spoilt, used = [], 0
+    for x, known in zip(moving, (None, None, levels), strict=True):
+        if x is not None:
+            sizes = [signals.noise_level(column) for column in x.T] if known is None else known
+            white = numbers[used : used + x.size].reshape(x.shape[::-1]).T
+            x, used = x + np.asarray(sizes) * white, used + x.size
+        spoilt.append(x)
+    velocity, acceleration, position = spoilt
+    assert position is not None
+    return Motion(position, motion.torque, velocity, acceleration)
+
+
+def _normal_numbers(n: int) -> NDArray[np.float64]:
+    """The first n of a sequence that is always the same."""
+    return _normal_sequence(1 << max(n - 1, 1).bit_length())[:n]
+
+
+@lru_cache(maxsize=2)
+def _normal_sequence(n: int) -> NDArray[np.float64]:
+    return np.random.default_rng(0).standard_normal(n)

@@ -9,10 +9,12 @@ from __future__ import annotations
 from functools import lru_cache, partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Integer, Num
+from jax import lax
+from jaxtyping import Array, Float, Int, Integer, Num
 from numpy.typing import NDArray
 
 from jaximp.types import AnyArray
@@ -61,6 +63,49 @@ def filter_zero_phase(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "
     start, end = 2 * x[:1] - x[edge:0:-1], 2 * x[-1:] - x[-2 : -edge - 2 : -1]
     y = _filter_from_rest(sos, jnp.concatenate([start, x, end]))
     return _filter_from_rest(sos, y, backward=True)[edge:-edge]
+
+
+def filter_zero_phase_padded(
+    filters: PaddedFilter, x: Num[AnyArray, "N k"], n: Int[AnyArray, ""]
+) -> Float[Array, "N k"]:
+    """`filter_zero_phase` of the first n samples; what stands behind them means nothing, before and after.
+
+    The extension is made at the true end. Between the two passes everything behind it takes the value at its end: a
+    filter that begins at rest there stays at rest, so that the numbers are those of the samples alone, to rounding.
+    """
+    edge, index = filters.edge, jnp.arange(x.shape[0] + filters.edge)
+    start = 2 * x[:1] - x[edge:0:-1]
+    behind = jnp.concatenate([x, jnp.zeros((edge, x.shape[1]), x.dtype)])
+    end = lax.dynamic_slice_in_dim(behind, n - 1 - edge, edge + 1)
+    end = lax.dynamic_update_slice_in_dim(behind, 2 * end[-1:] - end[-2::-1], n, 0)
+    y = _filter(filters.sos, filters.rest, jnp.concatenate([start, end]), backward=False)[edge:]
+    last = lax.dynamic_slice_in_dim(y, n + edge - 1, 1)
+    y = _filter(filters.sos, filters.rest, jnp.where(index[:, None] < n + edge, y, last), backward=True)
+    return y[:-edge]
+
+
+class PaddedFilter(eqx.Module):
+    """Second-order sections as arrays: recordings of other rates share the compiled code."""
+
+    sos: Float[AnyArray, "*B k 6"]
+    rest: Float[AnyArray, "*B k 2"]
+    """State of a unit input that lasts for ever."""
+    edge: int = eqx.field(static=True)
+    """Samples of the extension."""
+
+
+@lru_cache(maxsize=256)
+def padded_filter(sos: tuple[tuple[float, ...], ...]) -> PaddedFilter:
+    """The arrays of `filter_zero_phase_padded`."""
+    from scipy.signal import sosfilt_zi
+
+    sections = np.asarray(sos, np.float64)
+    return PaddedFilter(sections, np.asarray(sosfilt_zi(sections)), edge_samples(sections))
+
+
+def check_long_enough(sos: Sections, n: int) -> None:
+    """Refuse a recording of n samples that is too short for the extension."""
+    _edge_within(np.asarray(sos, np.float64), n)
 
 
 def filter_from_zero(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "N *k"]:
@@ -222,7 +267,7 @@ def zero_phase_matrix(sos: Sections, n: int, every: int = 1) -> NDArray[np.float
 
 
 def central_differences(
-    q: Num[AnyArray, "N *k"], sample_rate: float
+    q: Num[AnyArray, "N *k"], sample_rate: float | Float[AnyArray, ""]
 ) -> tuple[Float[AnyArray, "N *k"], Float[AnyArray, "N *k"]]:
     """First and second derivative by central differences; the first and last sample take one-sided ones.
 
@@ -236,6 +281,16 @@ def central_differences(
     last = (3 * q[-1:] - 4 * q[-2:-1] + q[-3:-2]) * (sample_rate / 2)
     ddq = (q[2:] - 2 * q[1:-1] + q[:-2]) * sample_rate**2
     return concatenate([first, dq, last]), concatenate([ddq[:1], ddq, ddq[-1:]])
+
+
+def central_differences_padded(
+    q: Num[AnyArray, "N k"], sample_rate: Float[AnyArray, ""], n: Int[AnyArray, ""]
+) -> tuple[Float[Array, "N k"], Float[Array, "N k"]]:
+    """`central_differences` of the first n samples; what stands behind them means nothing, before and after."""
+    dq, ddq = central_differences(q, sample_rate)
+    end = central_differences(lax.dynamic_slice_in_dim(q, n - 3, 3), sample_rate)
+    at_end = (jnp.arange(q.shape[0]) == n - 1)[:, None]
+    return jnp.where(at_end, end[0][-1:], dq), jnp.where(at_end, end[1][-1:], ddq)
 
 
 def savitzky_golay_half_length(sample_rate: float, cutoff: float = 50.0, order: int = 7) -> int:
@@ -404,12 +459,12 @@ def lengthen_gaps(valid: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return np.asarray(gone[by + 1 :] == gone[: len(valid)])
 
 
-def jumps(x: NDArray[np.float64]) -> NDArray[np.bool_]:
+def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool_]:
     """Where a signal (N,) leaps between two samples as no joint can move; both samples are True.
 
     A leap is a difference that exceeds six times all those nearby and twenty times the noise: a recorder that was
     switched, an encoder that lost counts, a trial that was cut. A filter would ring there, and the ringing would pass
-    for an excitation that the torque never saw.
+    for an excitation that the torque never saw. `noise` is the `noise_level`, where it is known.
     """
     from scipy.ndimage import maximum_filter1d
 
@@ -417,7 +472,7 @@ def jumps(x: NDArray[np.float64]) -> NDArray[np.bool_]:
     size = np.where(np.isfinite(size), size, 0.0)
     padded = np.pad(size, 6)
     before, after = (maximum_filter1d(padded, 5)[6 + shift : 6 + shift + len(size)] for shift in (-3, 3))
-    leap = (size > 6 * np.maximum(before, after)) & (size > 20 * noise_level(x))
+    leap = (size > 6 * np.maximum(before, after)) & (size > 20 * (noise_level(x) if noise is None else noise))
     return np.r_[leap, False] | np.r_[False, leap]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Float, Num
 from numpy.typing import NDArray
 
 from jaximp.least_squares import Fit, SlidingFit, WindowFit
@@ -57,7 +57,7 @@ class TrustLimits:
 
 def fake_change_threshold(
     W_reference: Num[AnyArray, "N p"], period_samples: int, window_samples: int
-) -> Float[Array, ""]:
+) -> Float[AnyArray, ""]:
     """Threshold on a window's condition number beyond which a change of its parameters is not real.
 
     **Arguments:** `W_reference` (N, p), the model's observation matrix on one period of the reference trajectory, of
@@ -65,7 +65,9 @@ def fake_change_threshold(
 
     **Source:** Tout et al. 2023, eqs. (16), (17).
     """
-    singular = jnp.linalg.svd(jnp.asarray(W_reference), compute_uv=False)
+    # A library call by itself is left to numpy: two compiled programs with LAPACK can block each other on few cores.
+    svd = np.linalg.svd if isinstance(W_reference, np.ndarray) else jnp.linalg.svd
+    singular = svd(W_reference, compute_uv=False)
     return singular[0] / singular[-1] * period_samples / window_samples
 
 
