@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from functools import cache, partial
@@ -291,6 +291,15 @@ def _solve_rows(task: Task, first: int, parts: list[Piece], skipped: int = 0) ->
     solved = _compiled(plan)(columns, scale, *task[1:])
     fit, length = jax.tree.map(lambda x: np.asarray(x)[:n_windows], solved)
     return _finished(_repaired(fit, length, task, columns, scale), length, task, first)
+
+
+def finish(fit: ChunkFit, task: Task, columns: Callable[[], tuple[Numbers, Numbers]]) -> SlidingFit:
+    """Fits of all windows of a recording that is one chunk, in numpy; `columns` and `scale` are made if one is doubtful."""
+    length = np.full(len(fit.theta), task.window)
+    if fit.doubtful.any():
+        fit = _repaired(fit, length, task, *columns())
+    found: SlidingFit = _finished(fit, length, task, 0)
+    return found
 
 
 class _Memory(threading.local):

@@ -501,7 +501,7 @@ def _estimates(
         verdicts=verdicts,
         threshold=threshold,
         time=rows.time[shown],
-        torque=measured.reshape(len(shown), -1),
+        torque=measured.reshape(reconstructed.shape),
         reconstructed=reconstructed,
         predicted=predicted,
         notes=(

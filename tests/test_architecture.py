@@ -19,7 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report", "impedance_report", "posterior_report", "check"),
     ("pages",),
     ("plots",),
-    ("inference",),
+    ("inference", "stacks"),
     ("identify", "impedance"),
     ("trials", "perturbations", "isolation"),
     ("regression",),
