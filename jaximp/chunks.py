@@ -294,7 +294,7 @@ def _solve_rows(task: Task, first: int, parts: list[Piece], skipped: int = 0) ->
 
 
 def finish(fit: ChunkFit, task: Task, columns: Callable[[], tuple[Numbers, Numbers]]) -> SlidingFit:
-    """Fits of all windows of a recording that is one chunk, in numpy; `columns` and `scale` are made if one is doubtful."""
+    """Fits of all windows of a recording that is one chunk, in numpy; `columns` makes its rows if one is doubtful."""
     length = np.full(len(fit.theta), task.window)
     if fit.doubtful.any():
         fit = _repaired(fit, length, task, *columns())

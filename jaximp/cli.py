@@ -1,16 +1,17 @@
-"""The command line: `jaximp demo | check | identify | posterior | design | simulate | reproduce`."""
+"""The command line: `jaximp demo | check | identify | batch | posterior | design | simulate | reproduce`."""
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -59,6 +60,14 @@ class Format(StrEnum):
 
     parquet = "parquet"
     csv = "csv"
+
+
+class Reports(StrEnum):
+    """Which recordings of a batch get a report of their own."""
+
+    all = "all"
+    failed = "failed"
+    none = "none"
 
 
 class Paper(StrEnum):
@@ -240,6 +249,53 @@ def simulate(
 
 
 @app.command()
+def batch(
+    job_file: JobFile,
+    files: Annotated[list[str] | None, typer.Argument(metavar="FILES", help="Recordings, patterns or folders.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("batch"),
+    manifest: Annotated[Path | None, typer.Option("--manifest", help="CSV or Parquet, a row per recording.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done.")] = False,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster.")] = 0,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Take up a run that was broken off.")] = False,
+    reports: Annotated[Reports, typer.Option("--reports", help="Which recordings get a report.")] = Reports.none,
+    partition: Annotated[list[str] | None, typer.Option("--partition", help="Column of the manifest.")] = None,
+    allow_outside: Annotated[bool, typer.Option("--allow-outside", help="A manifest may name any path.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but what failed.")] = False,
+    json_lines: Annotated[bool, typer.Option("--json", help="Say what happens in lines of JSON.")] = False,
+) -> None:
+    """Identify many recordings by one job, on all cores or on a cluster.
+
+    Writes a Parquet data set: estimates (a row per window) and recordings (a row each). What fails is listed in
+    quarantine.json, and the rest goes on; the exit status is 3 then. A run that was broken off goes on with --resume.
+    """
+    from jaximp.batch_plan import find_items, make_plan
+    from jaximp.job import read_job
+
+    job = read_job(job_file)
+    plan = make_plan(job, find_items(files or [], manifest, allow_outside), partition)
+    if dry_run:
+        for line in plan.in_words(job):
+            typer.echo(line)
+        return
+    from jaximp.batch import run_plan
+
+    with _interruptible(), _events(len(plan.items), quiet, json_lines) as tell:
+        outcome = run_plan(job, plan, out, workers, scheduler, resume, reports.value, tell)
+    if not json_lines:
+        for failed in outcome.failed:
+            console.print(f"failed: {failed['recording']}: {failed['reason']}", markup=False, soft_wrap=True)
+        for broken in outcome.broken:
+            console.print(f"unfinished: {broken}; run again with --resume", markup=False, soft_wrap=True)
+    if not (quiet or json_lines):
+        done = outcome.recordings - len(outcome.failed)
+        typer.echo(f"{done} of {outcome.recordings} recordings, {outcome.trusted} of {outcome.windows} windows trusted")
+        typer.echo(f"results: {out.resolve()}")
+    if outcome.exit_status:
+        raise typer.Exit(outcome.exit_status)
+
+
+@app.command()
 def reproduce(paper: Paper, out: Out, force: Force = False) -> None:
     """Redraw a paper's figures and tables; tables.json holds the numbers beside the paper's."""
     from jaximp.outputs import new_folder
@@ -327,6 +383,51 @@ def _say_result(estimates: Estimates) -> None:
 
 def _say_where(out: Path) -> None:
     typer.echo(f"report: {(out / 'report.html').resolve()}")
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM ends a batch as Ctrl-C does: what is done stays, `--resume` does the rest."""
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt:
+        console.print("interrupted: run again with --resume")
+        raise SystemExit(130) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _events(total: int, quiet: bool, json_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A bar with rate, failures and time left; or lines of JSON; or nothing."""
+    import json
+
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("identifying"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[failed]} failed"), TimeRemainingColumn(),
+    )  # fmt: skip
+    hidden = quiet or json_lines or not console.is_terminal
+    with Bar(*columns, console=console, transient=True, disable=hidden) as bar:
+        name = bar.add_task("", total=total, rate="", failed=0)
+
+        def tell(event: dict[str, Any]) -> None:
+            if json_lines:
+                typer.echo(json.dumps(event))
+            if event["event"] == "resume":
+                bar.update(name, completed=event["skipped"])
+            if event["event"] == "batch":
+                rate = f"{event['per_second']:.3g} a second"
+                bar.update(name, completed=event["done"], failed=event["failed"], rate=rate)
+
+        yield tell
 
 
 @contextmanager

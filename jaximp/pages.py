@@ -20,17 +20,22 @@ from jaximp import plots
 
 def versions() -> dict[str, str]:
     """Of what made the numbers."""
-    return {name: metadata.version(name) for name in ("jaximp", "jax", "numpy")}
+    return {name: _version(name) for name in ("jaximp", "jax", "numpy")}
+
+
+@cache
+def _version(name: str) -> str:
+    return metadata.version(name)
 
 
 def table_of(columns: Sequence[tuple[str, str, Any]], job: str) -> pa.Table:
     """A table of (name, unit, values): the unit is its field's metadata `unit`, the job's text is in the schema's."""
-    arrays = [pa.array(np.asarray(values)) for _, _, values in columns]
+    arrays = [values if isinstance(values, pa.Array) else pa.array(np.asarray(values)) for _, _, values in columns]
     fields = [
         pa.field(name, array.type, metadata={"unit": unit})
         for (name, unit, _), array in zip(columns, arrays, strict=True)
     ]
-    about = {"jaximp_version": metadata.version("jaximp"), "job": job}
+    about = {"jaximp_version": _version("jaximp"), "job": job}
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
 
 

@@ -218,7 +218,7 @@ class _HumanPart:
 
     def equilibrium(self) -> NDArray[np.float64]:
         """(M,) position at which the elastic torque vanishes."""
-        return np.asarray(self.model.equilibrium(jnp.asarray(self.theta)))
+        return np.asarray(self.model.equilibrium(self.theta))
 
     @property
     def factor(self) -> NDArray[np.float64]:
@@ -282,13 +282,18 @@ def _at_joint(estimates: Estimates, parts: list[_HumanPart]) -> dict[str, Any] |
     return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium, "reflex": reflex}
 
 
+def parameters_over_trusted(estimates: Estimates) -> dict[str, dict[str, Any]]:
+    """Mean, spread and median error of every parameter over the trusted windows; NaN where there are none."""
+    return _parameters(estimates, np.ones(len(estimates.names)))
+
+
 def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
     """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
     factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
     estimates = estimates.summarised()
     fit, trusted = estimates.fit, estimates.verdicts.trusted
     theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
-    low, high = confidence_interval(jnp.asarray(theta), jnp.asarray(stderr), fit.dof)
+    low, high = confidence_interval(theta, stderr, fit.dof)
     return {
         name: {
             "unit": unit,

@@ -10,9 +10,11 @@ then one recording after another is solved, whose numbers stay in the cache.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Lock
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,7 +26,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
-from jaximp.chunks import LONGEST_REACH, Task, finish, lags_for_sums
+from jaximp.chunks import LONGEST_REACH, Task, finish
 from jaximp.compilation import compiled
 from jaximp.engine import BLOCK, ChunkFit, Plan, solve_chunk
 from jaximp.identify import Prepared, Solved, checked_models, reference_motion
@@ -159,8 +161,10 @@ def solve_stack(job: Job, several: Sequence[Measured], layout: Layout) -> list[P
 
     **Returns:** for each what `identify.in_windows` judges, or why nothing is left of it.
     """
-    filled = [*several, *several[:1] * (layout.stacked - len(several))]
-    found = jax.tree.map(np.asarray, _program(layout, several[0].model, _stacked(job, filled, layout)))
+    filled = [*several, *[several[0]] * (layout.stacked - len(several))]
+    stack, model = _stacked(job, filled, layout), several[0].model
+    with _first_call(layout, model):
+        found = jax.tree.map(np.asarray, _program(layout, model, stack))
     results: list[Prepared | ValueError] = []
     for k, one in enumerate(several):
         try:
@@ -168,6 +172,20 @@ def solve_stack(job: Job, several: Sequence[Measured], layout: Layout) -> list[P
         except ValueError as error:
             results.append(error)
     return results
+
+
+_lock, _known = Lock(), set[Any]()
+
+
+@contextmanager
+def _first_call(*program: Any) -> Iterator[None]:
+    """A program is compiled once, however many threads need it at the same time."""
+    if program in _known:
+        yield
+        return
+    with _lock:
+        yield
+        _known.add(program)
 
 
 def _stacked(job: Job, several: Sequence[Measured], layout: Layout) -> _Stack:

@@ -16,9 +16,12 @@ PACKAGE = Path(__file__).parents[1] / "jaximp"
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("cli",),
     ("studies",),
+    ("batch",),
+    ("batch_results",),
     ("report", "impedance_report", "posterior_report", "check"),
     ("pages",),
     ("plots",),
+    ("batch_plan",),
     ("inference", "stacks"),
     ("identify", "impedance"),
     ("trials", "perturbations", "isolation"),

@@ -114,12 +114,16 @@ class HumanJoint(Model):
         lags = 0 if self.reflex is None else len(self.reflex.lags)
         return jnp.asarray(theta) * jnp.array([n**2] * 3 + [n] * self.offset + [n**2] * lags)
 
-    def equilibrium(self, theta: Num[AnyArray, "*M p"]) -> Float[Array, "*M"]:
-        """Position [rad or m] at which the elastic torque vanishes, on the side of the gear that `theta` belongs to."""
-        theta = jnp.asarray(theta)
+    def equilibrium(self, theta: Num[AnyArray, "*M p"]) -> Float[AnyArray, "*M"]:
+        """Position [rad or m] at which the elastic torque vanishes, on the side of the gear that `theta` belongs to.
+
+        That of a numpy array is a numpy array.
+        """
+        theta = theta if isinstance(theta, np.ndarray) else jnp.asarray(theta)
         if not self.offset:
-            return jnp.zeros(theta.shape[:-1])
-        return -theta[..., 3] / theta[..., 2]
+            return 0 * theta[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return -theta[..., 3] / theta[..., 2]
 
 
 class RobotJoint(Model):

@@ -1,0 +1,340 @@
+"""Thousands of recordings by one job: the same batches on threads, on local workers or on somebody's cluster.
+
+Nothing is ever lost: a recording that fails is quarantined and the rest goes on; a run that was broken off, in whatever
+way, is taken up by `resume`, which skips every batch whose receipt still matches and gives the same bits as a run that
+nobody disturbed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from jaximp.batch_plan import Batch, Item, Plan, find_items, make_plan
+from jaximp.batch_results import (
+    UNFINISHED,
+    Interrupted,
+    Task,
+    finished,
+    receipt_path,
+    reserved_columns,
+    solve_batch,
+    write_whole,
+)
+from jaximp.chunks import cores
+from jaximp.job import Job
+from jaximp.outputs import MARK
+from jaximp.signals import require_float64
+
+Tell = Callable[[dict[str, Any]], None]
+"""Called with what happens: `{"event": "batch", "done": 64, ...}`."""
+
+FOLDERS = ("estimates", "recordings", "receipts", "reports")
+IN_FLIGHT = 2
+"""Batches that are handed out per worker: one is solved while the next one waits."""
+
+
+@dataclass
+class Outcome:
+    """What became of a study."""
+
+    recordings: int = 0
+    windows: int = 0
+    trusted: int = 0
+    skipped: int = 0
+    """Recordings that an earlier run had done."""
+    failed: list[dict[str, Any]] = field(default_factory=list)
+    """Recordings in quarantine: `recording`, `file`, `reason`, `metadata`."""
+    broken: list[str] = field(default_factory=list)
+    """Batches that could not be finished, and why: `resume` does them again."""
+
+    @property
+    def exit_status(self) -> int:
+        return 1 if self.broken else 3 if self.failed else 0
+
+
+def run(
+    job: Job,
+    files: Sequence[str | Path] = (),
+    out: str | Path = "batch",
+    *,
+    manifest: str | Path | None = None,
+    allow_outside: bool = False,
+    partitions: Sequence[str] | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
+    resume: bool = False,
+    reports: str = "none",
+    tell: Tell = lambda event: None,
+) -> Outcome:
+    """Identify many recordings by one job.
+
+    **Arguments:** `files` recordings, patterns or folders, or else a `manifest` (`batch_plan.find_items`); `out` the
+    folder of the results; `partitions` the manifest's columns that results are partitioned by; `workers` processes on
+    this machine, or the address of a Dask `scheduler`, whose workers see the same files; `resume` takes up a run that
+    was broken off; `reports` of `all` recordings, of those `failed` (without a trusted window), or `none`.
+
+    **Raises:** `ValueError` for what cannot be begun; `KeyboardInterrupt` ends cleanly.
+    """
+    items = find_items([str(file) for file in files], None if manifest is None else Path(manifest), allow_outside)
+    return run_plan(job, make_plan(job, items, partitions), out, workers, scheduler, resume, reports, tell)
+
+
+def run_plan(
+    job: Job,
+    plan: Plan,
+    out: str | Path,
+    workers: int = 0,
+    scheduler: str | None = None,
+    resume: bool = False,
+    reports: str = "none",
+    tell: Tell = lambda event: None,
+) -> Outcome:
+    """As `run`, for a plan that is made."""
+    require_float64()
+    out = Path(os.path.abspath(out))
+    check_metadata(job, plan)
+    _prepare_folder(out, resume, plan.items)
+    task, outcome = Task.of(job, plan, out, reports), Outcome(recordings=len(plan.items))
+    with _log(out, tell) as log:
+        log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
+        left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
+        done = outcome.skipped
+        begin = time.perf_counter()
+        try:
+            for batch, found in _solved(task, left, workers, scheduler):
+                if isinstance(found, BaseException):
+                    why = f"{type(found).__name__}: {' '.join(str(found).split())}"
+                    outcome.broken.append(f"batch {batch.number}: {why}")
+                    log({"event": "broken", "batch": batch.number, "reason": why})
+                    continue
+                _take_up(outcome, found)
+                done += len(batch.items)
+                for failed in found["failed"]:
+                    log({"event": "failed", **failed})
+                rate = (done - outcome.skipped) / max(time.perf_counter() - begin, 1e-9)
+                log(
+                    {"event": "batch", "batch": batch.number, "done": done, "of": len(plan.items),
+                     "failed": len(outcome.failed), "per_second": rate}
+                )  # fmt: skip
+        except (KeyboardInterrupt, SystemExit):
+            log({"event": "interrupted", "done": done, "of": len(plan.items)})
+            raise
+        outcome.failed.sort(key=lambda failed: str(failed["recording"]))
+        write_whole(out / "quarantine.json", (json.dumps(outcome.failed, indent=1) + "\n").encode())
+        log(
+            {"event": "done", "recordings": outcome.recordings, "windows": outcome.windows, "trusted": outcome.trusted,
+             "failed": len(outcome.failed), "skipped": outcome.skipped, "broken": len(outcome.broken)}
+        )  # fmt: skip
+    return outcome
+
+
+def check_metadata(job: Job, plan: Plan) -> None:
+    """Refuse a manifest whose columns have the names of results."""
+    for name in plan.metadata:
+        if name in reserved_columns(job):
+            raise ValueError(f"the manifest's column '{name}' has the name of a result: rename it")
+
+
+def _take_up(outcome: Outcome, receipt: dict[str, Any]) -> None:
+    outcome.failed += receipt["failed"]
+    outcome.windows += receipt["windows"]
+    outcome.trusted += receipt["trusted"]
+
+
+# --- the folder -------------------------------------------------------------------------------------------------------
+
+
+def _prepare_folder(out: Path, resume: bool, items: Sequence[Item]) -> None:
+    if out.exists() and not resume:
+        raise ValueError(f"{out} exists: choose another --out, or pass --resume to take up what it holds")
+    if out.exists() and not (out / MARK).is_file() and any(out.iterdir()):
+        raise ValueError(f"{out} was not made by jaximp: choose another --out")
+    if any(out in item.file.parents for item in items):
+        raise ValueError(f"{out} holds recordings: choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / MARK).touch()
+    except OSError as error:
+        raise ValueError(f"{out} cannot be written: {error.strerror}; choose another --out") from None
+
+
+def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
+    """Leave nothing but what complete batches wrote; which batches are to be done."""
+    with ThreadPoolExecutor(cores()) as pool:
+        receipts = list(pool.map(lambda batch: finished(task, batch), plan.batches))
+    kept, left = set[Path](), []
+    for batch, receipt in zip(plan.batches, receipts, strict=True):
+        if receipt is None:
+            left.append(batch)
+            continue
+        kept |= {receipt_path(task.out, batch), *(task.out / name for name in receipt["outputs"])}
+        _take_up(outcome, receipt)
+        outcome.skipped += len(batch.items)
+    for folder in task.out.iterdir():
+        if folder.is_symlink() or not folder.is_dir() or not folder.name.startswith(FOLDERS[:3]):
+            continue
+        for where, _, names in os.walk(folder, topdown=False):
+            for path in (Path(where) / name for name in names):
+                if path not in kept:
+                    path.unlink()
+            with suppress(OSError):
+                Path(where).rmdir()  # unless it still holds something
+    for path in task.out.glob(f".*{UNFINISHED}"):
+        path.unlink()
+    log({"event": "resume", "skipped": outcome.skipped, "left": sum(len(batch.items) for batch in left)})
+    return left
+
+
+@contextmanager
+def _log(out: Path, tell: Tell) -> Iterator[Tell]:
+    """What happens goes to batch.log as well, a line of JSON each. A full disk must not end a run by its log."""
+    with (out / "batch.log").open("a", encoding="utf-8") as file:
+
+        def log(event: dict[str, Any]) -> None:
+            with suppress(OSError):
+                file.write(json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **event}) + "\n")
+                file.flush()
+            tell(event)
+
+        yield log
+
+
+# --- who solves -------------------------------------------------------------------------------------------------------
+
+Found = Iterator[tuple[Batch, dict[str, Any] | BaseException]]
+
+
+def _solved(task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None) -> Found:
+    """Every batch with its receipt, or with why there is none, in the order in which they are done."""
+    if scheduler is not None or workers > 0:
+        return _on_workers(task, batches, workers, scheduler)
+    return _on_threads(task, batches)
+
+
+def _on_threads(task: Task, batches: Sequence[Batch]) -> Found:
+    """In this process: while one batch is solved, others are read and written."""
+    stop = threading.Event()
+    pool = ThreadPoolExecutor(cores())
+
+    def solve(batch: Batch) -> dict[str, Any]:
+        return solve_batch(task, batch, stop.is_set)
+
+    try:
+        yield from _in_turn(batches, cores() + 1, lambda batch: pool.submit(solve, batch), _first_done)
+    finally:
+        stop.set()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _first_done(futures: list[Future[Any]]) -> list[Future[Any]]:
+    # A wait without end could not be interrupted by a signal on every system.
+    while not (done := wait(futures, timeout=1.0, return_when=FIRST_COMPLETED).done):
+        pass
+    return [future for future in futures if future in done]
+
+
+def _in_turn(
+    batches: Sequence[Batch], at_once: int, submit: Callable[[Batch], Any], first_done: Callable[[list[Any]], list[Any]]
+) -> Found:
+    """Never more than a few batches at a time, so that memory does not depend on how many there are."""
+    waiting, ahead = dict[Any, Batch](), iter(batches)
+    while True:
+        for batch in ahead:
+            waiting[submit(batch)] = batch
+            if len(waiting) >= at_once:
+                break
+        if not waiting:
+            return
+        for future in first_done(list(waiting)):
+            batch = waiting.pop(future)
+            try:
+                found: Any = future.result()
+            except Exception as error:
+                found = error
+            yield batch, found
+
+
+def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None) -> Found:
+    """On the workers of a Dask cluster; a local one listens on the loopback interface alone."""
+    try:
+        from distributed import Client, LocalCluster
+        from distributed import wait as wait_for
+    except ImportError:
+        raise ValueError("workers need Dask: pip install 'jaximp[batch]', or leave out --workers") from None
+    cluster = None
+    if scheduler is None:
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tcp://",
+            dashboard_address=None, worker_dashboard_address=None, silence_logs=50, env=_environment(),
+        )  # fmt: skip
+    try:
+        with Client(cluster if cluster is not None else scheduler, timeout=30) as client:
+            if cluster is not None:
+                for number, address in enumerate(sorted(client.scheduler_info(n_workers=-1)["workers"])):
+                    client.run(_settle, number, workers, workers=[address])
+
+            def submit(batch: Batch) -> Any:
+                return client.submit(_work, task, batch, pure=False)
+
+            def first_done(futures: list[Any]) -> list[Any]:
+                done = wait_for(futures, return_when="FIRST_COMPLETED").done
+                return [future for future in futures if future in done]
+
+            at_once = IN_FLIGHT * (workers or max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
+            yield from _in_turn(batches, at_once, submit, first_done)
+    finally:
+        if cluster is not None:
+            cluster.close()
+
+
+def _environment() -> dict[str, str]:
+    """Of a worker: it keeps to its cores, and to float64."""
+    return {"JAX_ENABLE_X64": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def _settle(number: int, workers: int) -> None:
+    """Give a local worker cores, and an accelerator, of its own; before its first computation."""
+    if hasattr(os, "sched_setaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        share = max(1, len(mine) // workers)
+        first = number * share % len(mine)
+        os.sched_setaffinity(0, set(mine[first : first + share]))
+    accelerators = len(list(Path("/dev").glob("nvidia[0-9]*")))
+    if accelerators > 1 and "CUDA_VISIBLE_DEVICES" not in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = str(number % accelerators)
+
+
+def _work(task: Task, batch: Batch) -> dict[str, Any]:
+    """A batch on a worker, whatever its settings."""
+    import jax
+
+    with jax.enable_x64(True):
+        return solve_batch(task, batch)
+
+
+# --- what was found ---------------------------------------------------------------------------------------------------
+
+
+def read_recordings(out: str | Path) -> pa.Table:
+    """One row per recording of a finished batch, in the order of their names."""
+    import pyarrow.dataset as ds
+
+    files = sorted(str(path) for path in (Path(out) / "recordings").glob("batch-*.parquet"))
+    tables = [ds.dataset(file, format="parquet").to_table() for file in files]
+    if not tables:
+        raise ValueError(f"{out} holds no recordings: run the batch first")
+    return pa.concat_tables(tables, promote_options="permissive").sort_by("recording")
+
+
+__all__ = ["Interrupted", "Outcome", "find_items", "make_plan", "read_recordings", "run", "run_plan"]

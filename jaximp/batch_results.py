@@ -1,0 +1,440 @@
+"""One batch: its recordings are read, solved and judged, and its results written whole or not at all.
+
+A batch writes one Parquet file of windows for every partition, one of recordings, and last of all a receipt: the
+checksums of what went in and what came out. Every file is written under a temporary name and then renamed, so that
+whatever breaks off a batch leaves either its receipt or nothing that counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from jaximp.batch_plan import LONGEST_STACKED, MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
+from jaximp.identify import Estimates, identify_recording, in_windows
+from jaximp.job import Job
+from jaximp.least_squares import SlidingFit
+from jaximp.models import Model
+from jaximp.pages import table_of, versions
+from jaximp.readers import RecordingError, count_samples
+from jaximp.recordings import recording_from_mapping
+from jaximp.regression import design_filters
+from jaximp.report import estimates_table, parameters_over_trusted
+from jaximp.stacks import Measured, measure, solve_stack
+from jaximp.trust import VERDICTS, Verdicts
+from jaximp.types import Recording
+
+UNFINISHED = ".unfinished"
+"""End of a temporary name."""
+RUN_COLUMNS = ("seconds",)
+"""Columns of the recordings' table that differ from run to run."""
+OK, FAILED = "ok", "failed"
+
+_one_at_a_time = Lock()
+"""What may use LAPACK or draws figures: two such programs at a time can block each other."""
+
+
+class Interrupted(Exception):
+    """The batch was asked to stop before it wrote anything."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every batch of a run has in common; it travels to workers."""
+
+    job: Job
+    out: Path
+    metadata: tuple[str, ...]
+    partitions: tuple[str, ...]
+    sizes: tuple[int, ...]
+    reports: str = "none"
+    """`all`, `failed` (recordings without a trusted window) or `none`."""
+
+    @classmethod
+    def of(cls, job: Job, plan: Plan, out: Path, reports: str = "none") -> Task:
+        return cls(job, out, plan.metadata, plan.partitions, plan.sizes, reports)
+
+    def key(self, batch: Batch) -> str:
+        """Checksum of everything that a batch's results depend on, its inputs' content apart."""
+        members = [(item.name, item.metadata, str(item.robot_file or ""), item.refused) for item in batch.items]
+        about = [job_checksum(self.job), versions(), self.partitions, self.metadata, self.sizes, batch.padded, members]
+        return checksum(json.dumps(about, sort_keys=True).encode())
+
+
+@dataclass
+class Result:
+    """What became of one recording."""
+
+    item: Item
+    estimates: list[Estimates] = field(default_factory=list)
+    """One for each method; none where it failed."""
+    recording: Recording | None = None
+    reason: str = ""
+    seconds: float = 0.0
+    sha256: str = ""
+
+    @property
+    def status(self) -> str:
+        return OK if self.estimates else FAILED
+
+
+def checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def file_checksum(path: Path | None) -> str:
+    """SHA-256 of a file, or nothing where it cannot be read."""
+    if path is None or why_refused(path):
+        return ""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def job_checksum(job: Job) -> str:
+    """Of the job file and of the design that it names."""
+    design = "" if job.design is None else file_checksum(job.folder / job.design)
+    robot = (job.robot_recording or {}).get("file")
+    alone = "" if robot is None else file_checksum(job.folder / str(robot))
+    return checksum("\n".join([job.text, design, alone]).encode())
+
+
+def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: False) -> dict[str, Any]:
+    """Read, solve, judge and write a batch.
+
+    **Returns:** its receipt, which is on disk too.
+
+    **Raises:** `Interrupted` if it is to stop, `OSError` where results cannot be written. What is wrong with a
+    recording raises nothing: the receipt says it.
+    """
+    begin = time.perf_counter()
+    results = [_read(task, item) for item in batch.items]
+    if stopped():
+        raise Interrupted
+    _solve(task, batch, results)
+    if stopped():
+        raise Interrupted
+    _write_reports(task, results)
+    outputs = _write_tables(task, batch, results)
+    receipt = {
+        "batch": batch.number,
+        "key": task.key(batch),
+        "inputs": {result.item.name: result.sha256 for result in results},
+        "outputs": outputs,
+        "failed": [failure(result.item, result.reason) for result in results if result.status == FAILED],
+        "windows": sum(len(result.estimates[0].start) for result in results if result.estimates),
+        "trusted": sum(int(result.estimates[0].verdicts.trusted.sum()) for result in results if result.estimates),
+        "run": {"seconds": time.perf_counter() - begin},
+    }
+    write_whole(receipt_path(task.out, batch), (json.dumps(receipt, indent=1) + "\n").encode())
+    return receipt
+
+
+def failure(item: Item, reason: str) -> dict[str, Any]:
+    """One line of the quarantine."""
+    return {"recording": item.name, "file": str(item.file), "reason": reason, "metadata": dict(item.metadata)}
+
+
+def receipt_path(out: Path, batch: Batch) -> Path:
+    return out / "receipts" / f"batch-{batch.number:05d}.json"
+
+
+def finished(task: Task, batch: Batch) -> dict[str, Any] | None:
+    """The receipt of a batch that is complete and still matches its inputs, the job and its own files."""
+    try:
+        receipt: dict[str, Any] = json.loads(receipt_path(task.out, batch).read_text(encoding="utf-8"))
+        if receipt["key"] != task.key(batch):
+            return None
+        if any(receipt["inputs"][item.name] != _input_checksum(item) for item in batch.items):
+            return None
+        if any(file_checksum(task.out / name) != found for name, found in receipt["outputs"].items()):
+            return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return receipt
+
+
+def _input_checksum(item: Item) -> str:
+    alone = "" if item.robot_file is None else "+" + file_checksum(item.robot_file)
+    return file_checksum(item.file) + alone
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """A file that appears whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    try:
+        with unfinished.open("wb") as file:
+            file.write(content)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+# --- reading and solving ----------------------------------------------------------------------------------------------
+
+
+def _read(task: Task, item: Item) -> Result:
+    begin = time.perf_counter()
+    result = Result(item, sha256=_input_checksum(item), reason=item.refused)
+    if not result.reason:
+        with _reasons(result):
+            result.recording = _load(task.job.recording, item.file, task.job.folder)
+    result.seconds = time.perf_counter() - begin
+    return result
+
+
+def _load(table: Mapping[str, Any], file: Path, folder: Path) -> Recording:
+    """A recording of reasonable size, from a plain file."""
+    refused = why_refused(file)
+    if refused:
+        raise RecordingError(f"{file}: {refused}")
+    samples = count_samples(file, channel_columns(table))
+    if samples > MOST_SAMPLES:
+        raise RecordingError(f"{file}: it claims {samples:.3g} samples, above {MOST_SAMPLES:.3g}: cut it into parts")
+    return recording_from_mapping({**table, "file": os.path.abspath(file)}, folder)
+
+
+class _reasons:
+    """Whatever goes wrong with a recording becomes the reason why it failed; to run out of memory does not."""
+
+    def __init__(self, result: Result):
+        self.result = result
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
+        if not isinstance(error, Exception) or isinstance(error, MemoryError):
+            return False
+        expected = isinstance(error, ValueError | OSError)
+        text = " ".join(str(error).split())
+        self.result.reason = text if expected else f"{type(error).__name__}: {text}"
+        self.result.estimates = []
+        return True
+
+
+def _solve(task: Task, batch: Batch, results: Sequence[Result]) -> None:
+    """Estimates of every recording that could be read, or the reason why there are none."""
+    job, stacks = task.job, dict[Any, list[tuple[Result, Measured]]]()
+    for result in results:
+        begin = time.perf_counter()
+        if result.recording is not None:
+            with _reasons(result):
+                size = next((size for size in task.sizes if size >= len(result.recording)), 0)
+                if batch.padded and size and len(result.recording) <= LONGEST_STACKED:
+                    found = measure(job, result.recording)
+                    program = found.layout(job, size), found.model
+                    stacks.setdefault(program, []).append((result, found))
+                else:
+                    with _one_at_a_time:
+                        alone = _alone(task, result.item)
+                        result.estimates = identify_recording(job, result.recording, alone)
+        result.seconds += time.perf_counter() - begin
+    for (layout, _), members in stacks.items():
+        begin = time.perf_counter()
+        prepared = solve_stack(job, [found for _, found in members], layout)
+        share = (time.perf_counter() - begin) / len(members)
+        for (result, _), one in zip(members, prepared, strict=True):
+            begin = time.perf_counter()
+            with _reasons(result):
+                if isinstance(one, ValueError):
+                    raise one
+                result.estimates = in_windows(job, one, curves=False)
+            result.seconds += share + time.perf_counter() - begin
+
+
+def _alone(task: Task, item: Item) -> Recording | None:
+    """The recording of the robot alone: the manifest's, or the job's."""
+    table = task.job.robot_recording
+    if table is None:
+        return None
+    file = item.robot_file or task.job.folder / str(table["file"])
+    return _robot_alone(json.dumps(dict(table), sort_keys=True), file, task.job.folder)
+
+
+@lru_cache(maxsize=4)
+def _robot_alone(table: str, file: Path, folder: Path) -> Recording:
+    return _load(json.loads(table), file, folder)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _write_tables(task: Task, batch: Batch, results: Sequence[Result]) -> dict[str, str]:
+    """Write windows and recordings; the checksum of each file by its path below the output."""
+    name, written = f"batch-{batch.number:05d}.parquet", {}
+    tables = {f"recordings/{name}": recordings_table(task, results)}
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        if result.estimates:
+            groups.setdefault(result.item.partition(task.partitions), []).append(result)
+    for partition, members in groups.items():
+        for k, first in enumerate(members[0].estimates):
+            folder = "estimates" if k == 0 else f"estimates_method{first.method}"
+            path = "/".join(filter(None, (folder, partition, name)))
+            tables[path] = windows_table(task.job, members, k)
+    for path, table in tables.items():
+        buffer = pa.BufferOutputStream()
+        texts = [column.name for column in table.schema if column.type == pa.string()]
+        pq.write_table(table, buffer, use_dictionary=texts, compression="zstd")
+        content = buffer.getvalue().to_pybytes()
+        write_whole(task.out / path, content)
+        written[path] = checksum(content)
+    return written
+
+
+def windows_table(job: Job, results: Sequence[Result], k: int = 0) -> pa.Table:
+    """One row per window of all recordings: the columns of `estimates.parquet`, behind the recording's name."""
+    several = [result.estimates[k] for result in results]
+    recording = results[0].recording
+    assert recording is not None
+    human = job.models(recording.joints)[1]
+    table = estimates_table(_one_after_another(several), human, job)
+    names = pa.array(np.repeat([result.item.name for result in results], [len(one.start) for one in several]))
+    return table.add_column(0, pa.field("recording", pa.string(), metadata={"unit": ""}), names.cast(pa.string()))
+
+
+def _one_after_another(several: Sequence[Estimates]) -> Estimates:
+    """The windows of several recordings as if of one; curves are left out."""
+
+    def joined(arrays: Sequence[Any]) -> Any:
+        return np.concatenate([np.asarray(array) for array in arrays])
+
+    fit = {one.name: joined([getattr(e.fit, one.name) for e in several]) for one in fields(SlidingFit)}
+    return replace(
+        several[0],
+        start=joined([e.start for e in several]),
+        end=joined([e.end for e in several]),
+        fit=SlidingFit(**fit),
+        held_out_vaf=joined([e.held_out_vaf for e in several]),
+        verdicts=Verdicts(joined([e.verdicts.verdict for e in several]), joined([e.verdicts.reason for e in several])),
+    )
+
+
+def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
+    """One row per recording: where it comes from, what was found, and what made it."""
+    job, model = task.job, _model_of(task.job, results)
+    columns: list[tuple[str, str, Any]] = [
+        ("recording", "", _texts(result.item.name for result in results)),
+        ("file", "", _texts(str(result.item.file) for result in results)),
+    ]
+    metadata = [dict(result.item.metadata) for result in results]
+    columns += [(name, "", _texts(row.get(name, "") for row in metadata)) for name in task.metadata]
+    found = [result.recording for result in results]
+    columns += [
+        ("status", "", _texts(result.status for result in results)),
+        ("reason", "", _texts(result.reason for result in results)),
+        ("samples", "1", np.array([0 if r is None else len(r) for r in found])),
+        ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in found)),
+        ("duration_s", "s", _numbers(r and r.time[-1] - r.time[0] for r in found)),
+        ("valid_share", "1", _numbers(r and r.valid.mean() for r in found)),
+        ("windows", "1", np.array([len(r.estimates[0].start) if r.estimates else 0 for r in results])),
+    ]
+    counts = [r.estimates[0].verdicts.counts() if r.estimates else dict.fromkeys(VERDICTS, 0) for r in results]
+    columns += [(name, "1", np.array([count[name] for count in counts])) for name in VERDICTS]
+    if model is not None:
+        parameters = [parameters_over_trusted(r.estimates[0]) if r.estimates else {} for r in results]
+        for name, unit in zip(model.names, model.units, strict=True):
+            for what in ("mean", "sd", "median_stderr", "half_width_95"):
+                values = _numbers(one.get(name, {}).get(what) for one in parameters)
+                columns.append((f"{name}_{what}", unit, values))
+    columns += [
+        ("threshold", "1", _numbers(r.estimates[0].threshold if r.estimates else None for r in results)),
+        ("notes", "", _texts("\n".join(r.estimates[0].notes) if r.estimates else "" for r in results)),
+        ("model", "", _texts("" if model is None else model.label for _ in results)),
+        ("filters", "", _texts(_filters(job, r) for r in found)),
+        ("versions", "", _texts([json.dumps(versions())] * len(results))),
+        ("sha256", "", _texts(r.sha256 for r in results)),
+        ("job_sha256", "", _texts([job_checksum(job)] * len(results))),
+        ("seconds", "s", np.array([r.seconds for r in results])),
+    ]
+    return table_of(columns, job.text)
+
+
+def reserved_columns(job: Job) -> set[str]:
+    """Names that a manifest's columns cannot have, beside those of the parameters."""
+    table = recordings_table(Task(job, Path(), (), (), ()), [Result(Item("", Path()))])
+    return {*table.column_names, "recording", *("start_s", "end_s", "verdict", "vaf")}
+
+
+def _model_of(job: Job, results: Sequence[Result]) -> Model | None:
+    """What is identified: of the recordings that could be read, or as the job's columns suggest."""
+    joints = next((result.recording.joints for result in results if result.recording is not None), None)
+    if joints is None:
+        position, joint = job.recording.get("position"), job.recording.get("joint", "revolute")
+        position = position.get("column") if isinstance(position, Mapping) else position
+        n = 1 if isinstance(position, str) else len(position or "1")
+        joints = tuple(joint) if isinstance(joint, list) else (joint,) * n
+    try:
+        robot, human = job.models(joints)
+    except (ValueError, KeyError):
+        return None
+    return robot if human is None else human
+
+
+def _filters(job: Job, recording: Recording | None) -> str:
+    rate = None if recording is None else recording.sample_rate
+    try:
+        decimate = job.filter.decimate if rate is None else design_filters(job.filter, rate).decimate
+    except ValueError:
+        decimate = job.filter.decimate
+    return json.dumps(asdict(job.filter) | {"decimate": decimate})
+
+
+def _texts(values: Any) -> Any:
+    return pa.array(list(values), pa.string())
+
+
+def _numbers(values: Any) -> Any:
+    return np.array([np.nan if value is None else float(value) for value in values])
+
+
+# --- reports ----------------------------------------------------------------------------------------------------------
+
+
+def report_folder(out: Path, name: str) -> Path:
+    """Where the report of a recording stands; what is no plain letter in its name is percent-encoded."""
+    plain = quote(name, safe="")
+    return out / "reports" / (plain if len(plain) < 200 else checksum(name.encode()))
+
+
+def _write_reports(task: Task, results: Sequence[Result]) -> None:
+    """The reports that were asked for, as `identify` writes them."""
+    for result in results:
+        wanted = task.reports == "all" or (
+            task.reports == "failed" and bool(result.estimates) and not result.estimates[0].verdicts.trusted.any()
+        )
+        if not wanted or not result.estimates or result.recording is None:
+            continue
+        with _one_at_a_time:
+            write_report_of(
+                task.job, result.recording, _alone(task, result.item), report_folder(task.out, result.item.name)
+            )
+
+
+def write_report_of(job: Job, recording: Recording, alone: Recording | None, folder: Path) -> None:
+    """What `identify` writes, for one recording."""
+    from jaximp.identify import at_other_lengths, prepare
+    from jaximp.outputs import new_folder
+    from jaximp.report import write_results
+
+    prepared = prepare(job, recording, alone)
+    estimates = in_windows(job, prepared, longest=2 * job.window.length)
+    others = at_other_lengths(job, prepared, alone)
+    with new_folder(folder, force=True) as draft:
+        write_results(draft, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
