@@ -69,6 +69,8 @@ class Batch:
     number: int
     padded: int
     """Samples that each is filled up to; zero where they are identified one by one."""
+    stacked: int
+    """Recordings of a full stack."""
     items: tuple[Item, ...]
 
 
@@ -88,9 +90,9 @@ class Plan:
         return [item for batch in self.batches for item in batch.items]
 
     @property
-    def sizes(self) -> tuple[int, ...]:
-        """Padded lengths, rising."""
-        return tuple(sorted({batch.padded for batch in self.batches if batch.padded}))
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """Padded lengths, rising, and how many recordings are stacked."""
+        return tuple(sorted({(batch.padded, batch.stacked) for batch in self.batches if batch.padded}))
 
     def in_words(self, job: Job) -> list[str]:
         """The plan, a line each."""
@@ -101,10 +103,10 @@ class Plan:
         which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
         lines.append(f"model: {' and '.join(which)}{methods}; windows of {job.window.length:g} s")
-        counts = Counter(batch.padded for batch in self.batches for _ in batch.items)
-        for size, count in sorted(counts.items()):
+        counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
+        for (size, stacked), count in sorted(counts.items()):
             if size:
-                lines.append(f"{count} of up to {size} samples, stacked {stack_size(size)} at a time")
+                lines.append(f"{count} of up to {size} samples, stacked {stacked} at a time")
             else:
                 lines.append(f"{count} one by one" + (f": {self.one_by_one}" * bool(self.one_by_one)))
         lines.append(f"partitioned by {', '.join(self.partitions)}" if self.partitions else "not partitioned")
@@ -262,9 +264,9 @@ def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None 
         groups[next(size for size in sizes if size >= item.samples) if fits else 0].append(item)
     batches: list[Batch] = []
     for size, members in groups.items():
-        together = stack_size(size) if size else FILES_IN_BATCH
+        together = stack_size(size, len(members)) if size else FILES_IN_BATCH
         for first in range(0, len(members), together):
-            batches.append(Batch(len(batches), size, tuple(members[first : first + together])))
+            batches.append(Batch(len(batches), size, together, tuple(members[first : first + together])))
     return Plan(tuple(batches), metadata, chosen, why)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximp.batch_plan import LONGEST_STACKED, MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
+from jaximp.batch_plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
 from jaximp.identify import Estimates, identify_recording, in_windows
 from jaximp.job import Job
 from jaximp.least_squares import SlidingFit
@@ -59,7 +59,7 @@ class Task:
     out: Path
     metadata: tuple[str, ...]
     partitions: tuple[str, ...]
-    sizes: tuple[int, ...]
+    sizes: tuple[tuple[int, int], ...]
     reports: str = "none"
     """`all`, `failed` (recordings without a trusted window) or `none`."""
 
@@ -235,10 +235,10 @@ def _solve(task: Task, batch: Batch, results: Sequence[Result]) -> None:
         begin = time.perf_counter()
         if result.recording is not None:
             with _reasons(result):
-                size = next((size for size in task.sizes if size >= len(result.recording)), 0)
-                if batch.padded and size and len(result.recording) <= LONGEST_STACKED:
+                size = next((size for size in task.sizes if size[0] >= len(result.recording)), None)
+                if batch.padded and size is not None:
                     found = measure(job, result.recording)
-                    program = found.layout(job, size), found.model
+                    program = found.layout(job, *size), found.model
                     stacks.setdefault(program, []).append((result, found))
                 else:
                     with _one_at_a_time:

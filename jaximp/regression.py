@@ -81,8 +81,8 @@ def _autocovariance(filters: Filters) -> NDArray[np.float64]:
 class Rows:
     """A filtered recording as least squares sees it; (N, ...) rows after decimation."""
 
-    W: Array
-    torque: Array
+    W: AnyArray
+    torque: AnyArray
     valid: NDArray[np.bool_]
     time: NDArray[np.float64]
 

@@ -51,6 +51,8 @@ from jaximp.windows import Score, score, sliding_least_squares, window_starts
 STACKED_SAMPLES = 400_000
 """Samples of a stack, padded ones too: its filtered columns take some hundred times as many bytes."""
 MOST_IN_STACK = 128
+CALL = 4
+"""What a call of a program costs, in recordings."""
 LAGS_GRAIN = 16
 """Lags of the noise's autocovariance are filled up with zeros to a multiple: rates that are alike share a program."""
 
@@ -64,9 +66,10 @@ def stackable(job: Job) -> str:
     return ""
 
 
-def stack_size(padded: int) -> int:
-    """How many recordings of so many samples are stacked: a power of two."""
-    return 1 << (max(1, min(MOST_IN_STACK, STACKED_SAMPLES // padded)).bit_length() - 1)
+def stack_size(padded: int, count: int) -> int:
+    """How many of `count` recordings of so many samples are stacked: a power of two; empty places and calls cost."""
+    most = max(1, min(MOST_IN_STACK, STACKED_SAMPLES // padded)).bit_length()
+    return min((1 << k for k in range(most)), key=lambda size: -(-count // size) * (size + CALL))
 
 
 class Layout(NamedTuple):
@@ -101,14 +104,14 @@ class Measured:
     clean: NDArray[np.bool_]
     reference: Any
 
-    def layout(self, job: Job, padded: int) -> Layout:
-        """The program that solves it, padded to so many samples."""
+    def layout(self, job: Job, padded: int, stacked: int) -> Layout:
+        """The program that solves it, padded to so many samples in a stack of so many recordings."""
         rate, n = self.recording.sample_rate, self.filters.decimate
         window = round(job.window.length * rate / n)
         step = max(1, round(step_seconds(job) * rate / n))
         noise = self.filters.noise
         lags = 0 if noise is None else -(-len(noise) // LAGS_GRAIN) * LAGS_GRAIN
-        return Layout(padded, stack_size(padded), n, window, step, lags)
+        return Layout(padded, stacked, n, window, step, lags)
 
 
 def measure(job: Job, recording: Recording) -> Measured:

@@ -1,0 +1,493 @@
+"""A batch gives what `identify` gives for each recording, whatever happens to it on the way."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from jaximp import batch, batch_results, stacks
+from jaximp.batch_plan import find_items, make_plan, padded_sizes
+from jaximp.identify import Estimates, identify_recording, in_windows
+from jaximp.job import Job, parse_job, read_job
+from jaximp.recordings import recording_from_arrays, save_recording
+from jaximp.types import Recording
+
+JOB = """
+[recording]
+file = "none.parquet"
+time = "time_s"
+position = "position_rad"
+torque = "torque_Nm"
+[model]
+human = true
+[filter]
+position_cutoff = 20
+decimation_cutoff = 10
+[window]
+length = 1
+step = 0.05
+"""
+RATE = 250.0
+LENGTHS = (1000, 1000, 1000, 1250, 1250, 1321, 1321, 1321)
+LINES = ((0.2, 1.1, 0.0), (0.1, 2.9, 0.5), (0.04, 6.3, 1.0))
+
+
+def joint(n: int, seed: int = 0, rate: float = RATE, stiffness: float = 20.0) -> Recording:
+    """A joint that moves at three frequencies, with noise in torque and position."""
+    time, random = np.arange(n) / rate, np.random.default_rng(seed)
+    q, dq, ddq = (
+        np.asarray(
+            sum(a * (2 * np.pi * f) ** k * np.sin(2 * np.pi * f * time + p + k * np.pi / 2) for a, f, p in LINES)
+        )
+        for k in range(3)
+    )
+    torque = 0.1 * ddq + 1.5 * dq + stiffness * q - 2 + random.normal(0, 0.2, n)
+    return recording_from_arrays(time, q + random.normal(0, 1e-4, n), torque)
+
+
+def beside(first: Recording, second: Recording) -> Recording:
+    """Two joints."""
+    both = (np.hstack([getattr(r, name) for r in (first, second)]) for name in ("position", "torque"))
+    return recording_from_arrays(first.time, *both)
+
+
+def spoilt(recording: Recording, part: slice) -> Recording:
+    """Without the samples of a stretch."""
+    torque = recording.torque.copy()
+    torque[part] = np.nan
+    return recording_from_arrays(recording.time, recording.position, torque)
+
+
+def still(recording: Recording, part: slice) -> Recording:
+    """Motionless for a stretch, where no window can be solved well."""
+    position, torque = recording.position.copy(), recording.torque.copy()
+    position[part], torque[part] = position[part][0], torque[part][0]
+    return recording_from_arrays(recording.time, position, torque)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight recordings of several lengths with a manifest, and the job; `reference` holds an undisturbed run."""
+    folder = tmp_path_factory.mktemp("study")
+    for k, n in enumerate(LENGTHS):
+        save_recording(joint(n, k, stiffness=20.0 + k), folder / f"r{k}.parquet")
+    subjects = ["S1", "S1", "<script>alert(1)</script>", "../x", "S1", "S2", "..", ""]
+    rows = [f"r{k}.parquet,{subject},{k % 2}" for k, subject in enumerate(subjects)]
+    (folder / "study.csv").write_text("file,subject,arm\n" + "\n".join(rows) + "\n")
+    (folder / "job.toml").write_text(JOB)
+    run(folder, folder / "reference")
+    return folder
+
+
+def run(folder: Path, out: Path, **options: object) -> batch.Outcome:
+    """The study's batch: of three lengths, and so three batches."""
+    job = read_job(folder / "job.toml")
+    return batch.run(job, out=out, manifest=folder / "study.csv", **options)
+
+
+def content(out: Path) -> dict[str, object]:
+    """All results, run metadata apart."""
+    found: dict[str, object] = {}
+    for path in sorted(out.rglob("*")):
+        name = path.relative_to(out).as_posix()
+        if not path.is_file() or name.startswith(("receipts/", "batch.log", ".jaximp")):
+            continue
+        if name.startswith("recordings/"):
+            found[name] = pq.ParquetFile(path).read().drop_columns(list(batch_results.RUN_COLUMNS))
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+# --- what a stack gives -----------------------------------------------------------------------------------------------
+
+
+def assert_same(found: Estimates, expected: Estimates) -> None:
+    assert found.names == expected.names
+    for name in ("theta", "stderr", "dof", "cond", "sigma_min", "excitation", "residual_rms", "vaf", "samples"):
+        np.testing.assert_allclose(getattr(found.fit, name), getattr(expected.fit, name), 1e-9, 1e-12, err_msg=name)
+    np.testing.assert_array_equal(found.fit.first, expected.fit.first)
+    np.testing.assert_array_equal(found.fit.last, expected.fit.last)
+    np.testing.assert_allclose(found.held_out_vaf, expected.held_out_vaf, 1e-9, 1e-9)
+    np.testing.assert_array_equal(found.verdicts.verdict, expected.verdicts.verdict)
+    np.testing.assert_array_equal(found.start, expected.start)
+    np.testing.assert_array_equal(found.end, expected.end)
+    assert found.threshold == expected.threshold
+    assert found.notes == expected.notes
+
+
+DECIMATE = ("decimation_cutoff = 10", "")
+LONG_NOISE = ("decimation_cutoff = 10", "decimation_cutoff = 2\ndecimate = 1")
+ODD_STEP = ("step = 0.05", "step = 0.036")
+CASES = {
+    "lengths": ([joint(1000), joint(1321, 1), joint(1390, 2)], [("", "")]),
+    "white noise": ([joint(1000), joint(1390, 2)], [DECIMATE]),
+    "noise with a long memory": ([joint(1390, 2)], [LONG_NOISE]),
+    "steps that miss the next window": ([joint(1000), joint(1390, 2)], [ODD_STEP]),
+    "sample rates": ([joint(1000), joint(1000, 1, 251.3), joint(1390, 2, 250.001)], [("", "")]),
+    "a gap": ([spoilt(joint(1390, 3), slice(600, 700)), spoilt(joint(1300, 4), slice(10, 12))], [("", "")]),
+    "a still stretch": ([still(joint(1390, 5), slice(500, 1000))], [("", "")]),
+    "slow samples": ([joint(1390, 6), joint(1200, 7)], [("step = 0.05", "step = 0.05\nmin_velocity = 0.3")]),
+    "two joints": ([beside(joint(1390, 8), joint(1390, 9)), beside(joint(1100, 10), joint(1100, 11))], [("", "")]),
+    "robot": ([joint(1390, 12)], [("human = true", "robot = { gravity = true, offset = true }")]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_padded_recording_gives_what_it_gives_alone(case: str) -> None:
+    recordings, changes = CASES[case]
+    text = JOB
+    for old, new in changes:
+        text = text.replace(old, new) if old else text
+    job = parse_job(text)
+    measured = [stacks.measure(job, recording) for recording in recordings]
+    for one, recording in zip(measured, recordings, strict=True):
+        layout = one.layout(job, 1400, 2)
+        prepared = stacks.solve_stack(job, [one], layout)[0]
+        assert not isinstance(prepared, ValueError)
+        assert_same(in_windows(job, prepared, curves=False)[0], identify_recording(job, recording)[0])
+
+
+def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
+    job = parse_job(JOB)
+    measured = [stacks.measure(job, joint(n, n)) for n in (1390, 1000)]
+    layout = measured[0].layout(job, 1400, 2)
+    together = stacks.solve_stack(job, measured, layout)
+    alone = [stacks.solve_stack(job, [one], layout)[0] for one in measured]
+    for one, other in zip(together, alone, strict=True):
+        assert not isinstance(one, ValueError)
+        assert not isinstance(other, ValueError)
+        np.testing.assert_array_equal(one.solved[0].fit.theta, other.solved[0].fit.theta)
+        np.testing.assert_array_equal(one.solved[0].fit.stderr, other.solved[0].fit.stderr)
+
+
+def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
+    """A thousand lengths are planned; of these a few dozen are run, at least one for each size."""
+    compiled: list[str] = []
+
+    def listen(event: str, seconds: float, **about: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    assert len(padded_sizes(range(1000, 2000))) <= 6
+    for k in range(24):
+        save_recording(joint(1003 + 17 * k, k), tmp_path / f"r{k:02d}.parquet")
+    jax.clear_caches()
+    stacks._known.clear()
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        outcome = batch.run(parse_job(JOB, tmp_path), [tmp_path], tmp_path / "out")
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert outcome.exit_status == 0
+    assert 0 < len(compiled) <= 6
+
+
+@pytest.mark.parametrize("most", [1, 2, 5])
+def test_as_little_as_possible_is_padded(most: int) -> None:
+    """Against all choices of sizes."""
+    from itertools import combinations
+
+    lengths = np.random.default_rng(0).choice(np.arange(100, 200), 12, replace=False).tolist()
+    lengths += [150, 150]
+    chosen = padded_sizes(lengths, most)
+
+    def padded(sizes: list[int]) -> int:
+        return sum(min(size for size in sizes if size >= n) for n in lengths)
+
+    choices = combinations(sorted(set(lengths))[:-1], most - 1)
+    assert padded(chosen) == min(padded([*some, max(lengths)]) for some in choices)
+    assert len(chosen) == most
+
+
+# --- the results ------------------------------------------------------------------------------------------------------
+
+
+def test_the_data_set_holds_what_identify_finds(study: Path) -> None:
+    out, job = study / "reference", read_job(study / "job.toml")
+    recordings = batch.read_recordings(out)
+    assert recordings["recording"].to_pylist() == [f"r{k}.parquet" for k in range(8)]
+    assert recordings["status"].to_pylist() == ["ok"] * 8
+    assert recordings["subject"].to_pylist()[2:4] == ["<script>alert(1)</script>", "../x"]
+    assert recordings.schema.field("stiffness_mean").metadata == {b"unit": b"N m/rad"}
+    import pyarrow.dataset as ds
+
+    windows = ds.dataset(out / "estimates", format="parquet", partitioning="hive").to_table()
+    assert set(windows["subject"].to_pylist()) == {"S1", "<script>alert(1)</script>", "../x", "S2", "..", None}
+    for k in (0, 3, 7):
+        expected = identify_recording(job, joint(LENGTHS[k], k, stiffness=20.0 + k))[0]
+        rows = windows.filter(pa.compute.equal(windows["recording"], f"r{k}.parquet")).sort_by("start_s")
+        np.testing.assert_allclose(rows["stiffness"], np.asarray(expected.fit.theta)[:, 2], 1e-9)
+        np.testing.assert_allclose(rows["stiffness_stderr"], np.asarray(expected.fit.stderr)[:, 2], 1e-9)
+        row = {name: recordings[name][k].as_py() for name in ("trusted", "windows", "stiffness_mean")}
+        assert row["windows"] == len(expected.start)
+        assert row["trusted"] == expected.verdicts.trusted.sum()
+        np.testing.assert_allclose(row["stiffness_mean"], expected.mean_over_trusted()[2], 1e-9)
+
+
+@pytest.mark.parametrize("reader", ["pandas", "polars", "duckdb"])
+def test_every_reader_reads_it(study: Path, reader: str) -> None:
+    library = pytest.importorskip(reader)
+    out = study / "reference"
+    expected = batch.read_recordings(out)["windows"].to_pylist()
+    if reader == "pandas":
+        windows = library.read_parquet(out / "estimates")
+        counts = windows.groupby("recording", observed=True).size().sort_index().tolist()
+        subjects = set(windows["subject"].dropna())
+    elif reader == "polars":
+        windows = library.read_parquet(str(out / "estimates/**/*.parquet"), hive_partitioning=True)
+        counts = windows.group_by("recording").len().sort("recording")["len"].to_list()
+        subjects = set(windows["subject"].drop_nulls())
+    else:
+        where = f"read_parquet('{out}/estimates/**/*.parquet', hive_partitioning = true)"
+        query = f"SELECT count(*) FROM {where} GROUP BY recording ORDER BY recording"
+        counts = [count for (count,) in library.sql(query).fetchall()]
+        subjects = {subject for (subject,) in library.sql(f"SELECT DISTINCT subject FROM {where}").fetchall()}
+    assert counts == expected
+    assert {"S1", "S2", "../x", "..", "<script>alert(1)</script>"} <= subjects
+
+
+# --- faults -----------------------------------------------------------------------------------------------------------
+
+
+class Fault:
+    """Something that goes wrong in a run, and how it is put right before the run is taken up again."""
+
+    def __init__(self, study: Path, monkeypatch: pytest.MonkeyPatch):
+        self.study, self.patch = study, monkeypatch
+
+    def after(self, count: int, then: Callable[[Path], object]) -> None:
+        """Do something when so many files of results have been written."""
+        written, original = [], batch_results.write_whole
+
+        def write(path: Path, content: bytes) -> None:
+            if len(written) == count:
+                then(path)
+            written.append(path)
+            original(path, content)
+
+        self.patch.setattr(batch_results, "write_whole", write)
+
+
+def full_disk(fault: Fault, out: Path) -> None:
+    """Every write fails from some point on, half of the file written."""
+
+    def fail(path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.with_name(f".{path.name}.1{batch_results.UNFINISHED}").write_bytes(b"PAR1")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    fault.after(4, fail)
+    outcome = run(fault.study, out)
+    assert outcome.exit_status == 1
+    assert "No space left" in outcome.broken[0]
+
+
+def interrupt(fault: Fault, out: Path) -> None:
+    """Ctrl-C between two files of a batch."""
+    fault.after(4, lambda path: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        run(fault.study, out)
+    assert not list(out.rglob(f"*{batch_results.UNFINISHED}"))
+
+
+def out_of_memory(fault: Fault, out: Path) -> None:
+    """A batch does not get its memory."""
+    original = batch_results.solve_stack
+
+    def solve(job: Job, several: list[stacks.Measured], layout: stacks.Layout) -> object:
+        if any(len(one.recording) == 1321 for one in several):
+            raise MemoryError("no more")
+        return original(job, several, layout)
+
+    fault.patch.setattr(batch_results, "solve_stack", solve)
+    assert run(fault.study, out).exit_status == 1
+
+
+def vanished_file(fault: Fault, out: Path) -> None:
+    """A file is gone when its turn comes, and back later."""
+    path, plan = fault.study / "r5.parquet", batch.make_plan
+
+    def then_gone(*args: object, **options: object) -> object:
+        made = plan(*args, **options)
+        path.rename(path.with_suffix(".away"))
+        return made
+
+    fault.patch.setattr(batch, "make_plan", then_gone)
+    try:
+        outcome = run(fault.study, out)
+    finally:
+        path.with_suffix(".away").rename(path)
+    assert outcome.exit_status == 3
+    assert [failed["recording"] for failed in outcome.failed] == ["r5.parquet"]
+
+
+def damaged_result(fault: Fault, out: Path) -> None:
+    """A file of results is cut, another one is lost."""
+    run(fault.study, out)
+    first, second = sorted((out / "estimates").rglob("*.parquet"))[:2]
+    first.write_bytes(first.read_bytes()[:-100])
+    second.unlink()
+
+
+def damaged_receipt(fault: Fault, out: Path) -> None:
+    run(fault.study, out)
+    sorted((out / "receipts").iterdir())[1].write_text("{")
+
+
+def killed_process(fault: Fault, out: Path) -> None:
+    """`kill -9` of the whole run, when the first batch is done."""
+    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", str(fault.study / "job.toml")]
+    command += ["--manifest", str(fault.study / "study.csv"), "--out", str(out), "--quiet"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not list(out.glob("receipts/*.json")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.002)
+    finally:
+        process.kill()
+        process.wait()
+
+
+FAULTS = [
+    full_disk, interrupt, out_of_memory, vanished_file, damaged_result, damaged_receipt, killed_process,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_nothing_is_lost_and_nothing_differs(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[Fault, Path], None]
+) -> None:
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        fault(Fault(study, patch), out)
+    outcome = run(study, out, resume=True)
+    expected = content(study / "reference")
+    found = content(out)
+    assert outcome.exit_status == 0
+    assert set(expected) - set(found) == set(), "lost"
+    assert [name for name in found if found[name] != expected.get(name)] == [], "differs"
+
+
+def test_a_second_resume_does_nothing_again(study: Path, tmp_path: Path) -> None:
+    run(study, tmp_path / "out")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("batch-*.parquet")}
+    outcome = run(study, tmp_path / "out", resume=True)
+    assert outcome.skipped == 8
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("batch-*.parquet")}
+
+
+def test_another_job_or_another_content_is_computed_again(study: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    for name in [*(f"r{k}.parquet" for k in range(8)), "study.csv", "job.toml"]:
+        (folder / name).write_bytes((study / name).read_bytes())
+    run(folder, tmp_path / "out")
+    save_recording(joint(LENGTHS[0], 99), folder / "r0.parquet")
+    assert 0 < run(folder, tmp_path / "out", resume=True).skipped < 8
+    (folder / "job.toml").write_text(JOB.replace("length = 1", "length = 1.5"))
+    assert run(folder, tmp_path / "out", resume=True).skipped == 0
+
+
+def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text("time_s,position_rad,torque_Nm\n0,1,x\n")
+    (tmp_path / "cut.parquet").write_bytes(b"PAR1")
+    save_recording(joint(100), tmp_path / "short.parquet")
+    save_recording(joint(1000), tmp_path / "good.parquet")
+    (tmp_path / "link.parquet").symlink_to(tmp_path / "good.parquet")
+    os.mkfifo(tmp_path / "pipe.parquet")
+    (tmp_path / "job.toml").write_text(JOB)
+    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", "job.toml", ".", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done.stderr
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert events[-1]["event"] == "done"
+    assert events[-1]["failed"] == 5
+    reasons = {one["recording"]: one["reason"] for one in json.loads((tmp_path / "batch/quarantine.json").read_text())}
+    assert set(reasons) == {"bad.csv", "cut.parquet", "short.parquet", "link.parquet", "pipe.parquet"}
+    assert "not a number" in reasons["bad.csv"]
+    assert "symbolic links" in reasons["link.parquet"]
+    assert "no plain file" in reasons["pipe.parquet"]
+    table = batch.read_recordings(tmp_path / "batch")
+    assert dict(zip(table["recording"].to_pylist(), table["status"].to_pylist(), strict=True))["good.parquet"] == "ok"
+
+
+# --- what a manifest may not do ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["../r0.parquet", "/etc/passwd", "away/r0.parquet", "x/../../r0.parquet"])
+def test_a_manifest_cannot_leave_its_folder(tmp_path: Path, path: str) -> None:
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    (inside / "away").symlink_to(tmp_path)
+    (inside / "study.csv").write_text(f"file\n{path}\n")
+    with pytest.raises(ValueError, match="allow-outside"):
+        find_items([], inside / "study.csv")
+    assert len(find_items([], inside / "study.csv", allow_outside=True)) == 1
+
+
+def test_a_recording_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "huge.h5", "w") as file:
+        for name in ("time_s", "position_rad", "torque_Nm"):
+            file.create_dataset(name, (10**12,), chunks=(1000,), dtype="f8")
+    monkeypatch.setattr(batch_results, "recording_from_mapping", lambda *args: pytest.fail("it was read"))
+    outcome = batch.run(parse_job(JOB, tmp_path), [tmp_path], tmp_path / "out")
+    assert "claims 1e+12 samples" in outcome.failed[0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("manifest", "why"),
+    [
+        ("subject\nS1\n", "column 'file'"),
+        ("file\na.csv\na.csv\n", "more than once"),
+        ("file,subject\na.csv\n", "more or fewer fields"),
+        ("file,verdict\na.csv,x\n", "name of a result"),
+        ("file,stiffness_mean\na.csv,x\n", "name of a result"),
+        ("file,subject\na.csv," + 200 * "x" + "\n", "too long"),
+    ],
+)
+def test_bad_manifests_are_refused(tmp_path: Path, manifest: str, why: str) -> None:
+    (tmp_path / "study.csv").write_text(manifest)
+    with pytest.raises(ValueError, match=why):
+        batch.run(parse_job(JOB), out=tmp_path / "out", manifest=tmp_path / "study.csv")
+
+
+def test_a_job_with_trials_is_refused(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    job = replace(parse_job(JOB), trials="anything")
+    with pytest.raises(ValueError, match="trials"):
+        make_plan(job, [])
+
+
+def test_a_folder_that_is_there_is_not_touched(study: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").touch()
+    with pytest.raises(ValueError, match="exists"):
+        run(study, tmp_path / "mine")
+    with pytest.raises(ValueError, match="not made by jaximp"):
+        run(study, tmp_path / "mine", resume=True)
+
+
+# --- workers ----------------------------------------------------------------------------------------------------------
+
+
+def test_workers_give_the_same_bits(study: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    assert run(study, tmp_path / "out", workers=2).exit_status == 0
+    assert content(tmp_path / "out") == content(study / "reference")
