@@ -27,8 +27,8 @@ from jaximp.job import Job
 from jaximp.readers import FORMATS, RecordingError, count_samples
 from jaximp.stacks import stack_size, stackable
 
-MOST_SIZES = 5
-"""Padded lengths of a plan: each is compiled once."""
+MOST_SIZES = 4
+"""Padded lengths of a plan: each is compiled once, and a study should need no more than six programs."""
 MOST_SAMPLES = 100_000_000
 """A recording that claims more is refused before anything is read (2.4 GB of time, position and torque)."""
 LONGEST_STACKED = 400_000
@@ -37,6 +37,8 @@ FILES_IN_BATCH = 16
 """Recordings of a batch whose recordings are not stacked."""
 PARTITIONS = ("subject", "session", "condition")
 """Columns of a manifest that partition the results, where nothing else is said."""
+MISSING = "missing"
+"""An empty value in a folder's name: the name that Hive has for it not every reader can digest."""
 LONGEST_NAME = 120
 """Letters of a value in a folder's name, after encoding."""
 
@@ -277,7 +279,8 @@ def padded_sizes(samples: Sequence[int], most: int = MOST_SIZES) -> list[int]:
         return [int(length) for length in lengths]
     if len(lengths) > 400:  # the best of so many is found among fewer
         grain = -(-int(lengths[-1]) // 400)
-        return padded_sizes(-(-np.repeat(lengths, counts) // grain) * grain, most)  # type: ignore[arg-type]
+        coarse = -(-np.repeat(lengths, counts) // grain) * grain
+        return padded_sizes(coarse.tolist(), most)
     # cost[j] of covering the j shortest with k sizes; the last of a group is its size.
     total = np.concatenate([[0], np.cumsum(counts)])
     cost, choices = np.where(np.arange(len(total)) == 0, 0.0, np.inf), []
@@ -331,4 +334,4 @@ def _check_partitions(chosen: Sequence[str], metadata: Sequence[str], items: Seq
 
 def _encoded(value: str) -> str:
     """A value as part of a folder's name: everything but plain letters is percent-encoded."""
-    return quote(value, safe="") or "__HIVE_DEFAULT_PARTITION__"
+    return quote(value, safe="") or MISSING

@@ -401,7 +401,8 @@ def _texts(values: Any) -> Any:
 
 
 def _numbers(values: Any) -> Any:
-    return np.array([np.nan if value is None else float(value) for value in values])
+    """What there is no number for is null."""
+    return pa.array([np.nan if value is None else float(value) for value in values], pa.float64(), from_pandas=True)
 
 
 # --- reports ----------------------------------------------------------------------------------------------------------

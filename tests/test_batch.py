@@ -116,47 +116,45 @@ def content(out: Path) -> dict[str, object]:
 
 
 def assert_same(found: Estimates, expected: Estimates) -> None:
+    """To rounding; where the windows hardly determine the parameters, rounding is what conditioning makes of it."""
     assert found.names == expected.names
+    np.testing.assert_array_equal(found.verdicts.verdict, expected.verdicts.verdict)
+    trusted = expected.verdicts.trusted
+    assert trusted.any()
     for name in ("theta", "stderr", "dof", "cond", "sigma_min", "excitation", "residual_rms", "vaf", "samples"):
-        np.testing.assert_allclose(getattr(found.fit, name), getattr(expected.fit, name), 1e-9, 1e-12, err_msg=name)
+        ours, theirs = (np.asarray(getattr(estimates.fit, name)) for estimates in (found, expected))
+        np.testing.assert_allclose(ours[trusted], theirs[trusted], 1e-9, 0, err_msg=name)
+        np.testing.assert_allclose(ours, theirs, 1e-4, 1e-9, err_msg=name)
     np.testing.assert_array_equal(found.fit.first, expected.fit.first)
     np.testing.assert_array_equal(found.fit.last, expected.fit.last)
-    np.testing.assert_allclose(found.held_out_vaf, expected.held_out_vaf, 1e-9, 1e-9)
-    np.testing.assert_array_equal(found.verdicts.verdict, expected.verdicts.verdict)
+    np.testing.assert_allclose(found.held_out_vaf[trusted], expected.held_out_vaf[trusted], 1e-9, 1e-9)
+    np.testing.assert_array_equal(np.isnan(found.held_out_vaf), np.isnan(expected.held_out_vaf))
     np.testing.assert_array_equal(found.start, expected.start)
     np.testing.assert_array_equal(found.end, expected.end)
     assert found.threshold == expected.threshold
     assert found.notes == expected.notes
 
 
-DECIMATE = ("decimation_cutoff = 10", "")
-LONG_NOISE = ("decimation_cutoff = 10", "decimation_cutoff = 2\ndecimate = 1")
-ODD_STEP = ("step = 0.05", "step = 0.036")
 CASES = {
-    "lengths": ([joint(1000), joint(1321, 1), joint(1390, 2)], [("", "")]),
-    "white noise": ([joint(1000), joint(1390, 2)], [DECIMATE]),
-    "noise with a long memory": ([joint(1390, 2)], [LONG_NOISE]),
-    "steps that miss the next window": ([joint(1000), joint(1390, 2)], [ODD_STEP]),
-    "sample rates": ([joint(1000), joint(1000, 1, 251.3), joint(1390, 2, 250.001)], [("", "")]),
-    "a gap": ([spoilt(joint(1390, 3), slice(600, 700)), spoilt(joint(1300, 4), slice(10, 12))], [("", "")]),
-    "a still stretch": ([still(joint(1390, 5), slice(500, 1000))], [("", "")]),
-    "slow samples": ([joint(1390, 6), joint(1200, 7)], [("step = 0.05", "step = 0.05\nmin_velocity = 0.3")]),
-    "two joints": ([beside(joint(1390, 8), joint(1390, 9)), beside(joint(1100, 10), joint(1100, 11))], [("", "")]),
-    "robot": ([joint(1390, 12)], [("human = true", "robot = { gravity = true, offset = true }")]),
+    "lengths and rates": ([joint(1000), joint(1321, 1, 251.3), joint(1390, 2, 250.001)], "", ""),
+    "white noise": ([joint(1321)], "decimation_cutoff = 10", ""),
+    "noise with a long memory": ([joint(1321, 2)], "decimation_cutoff = 10", "decimation_cutoff = 8\ndecimate = 1"),
+    "steps that miss the next window": ([joint(1321)], "step = 0.05", "step = 0.036"),
+    "gaps": ([spoilt(spoilt(joint(1321, 3), slice(600, 700)), slice(10, 12))], "", ""),
+    "a still stretch": ([still(joint(1321, 5), slice(500, 1000))], "", ""),
+    "slow samples": ([joint(1321, 6)], "step = 0.05", "step = 0.05\nmin_velocity = 0.3"),
+    "two joints": ([beside(joint(1321, 8), joint(1321, 9))], "", ""),
+    "robot": ([joint(1321, 12)], "human = true", "robot = { gravity = true, offset = true }"),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_padded_recording_gives_what_it_gives_alone(case: str) -> None:
-    recordings, changes = CASES[case]
-    text = JOB
-    for old, new in changes:
-        text = text.replace(old, new) if old else text
-    job = parse_job(text)
-    measured = [stacks.measure(job, recording) for recording in recordings]
-    for one, recording in zip(measured, recordings, strict=True):
-        layout = one.layout(job, 1400, 2)
-        prepared = stacks.solve_stack(job, [one], layout)[0]
+    recordings, old, new = CASES[case]
+    job = parse_job(JOB.replace(old, new) if old else JOB)
+    for recording in recordings:
+        one = stacks.measure(job, recording)
+        prepared = stacks.solve_stack(job, [one], one.layout(job, 1400, 2))[0]
         assert not isinstance(prepared, ValueError)
         assert_same(in_windows(job, prepared, curves=False)[0], identify_recording(job, recording)[0])
 
@@ -226,7 +224,7 @@ def test_the_data_set_holds_what_identify_finds(study: Path) -> None:
     import pyarrow.dataset as ds
 
     windows = ds.dataset(out / "estimates", format="parquet", partitioning="hive").to_table()
-    assert set(windows["subject"].to_pylist()) == {"S1", "<script>alert(1)</script>", "../x", "S2", "..", None}
+    assert set(windows["subject"].to_pylist()) == {"S1", "<script>alert(1)</script>", "../x", "S2", "..", "missing"}
     for k in (0, 3, 7):
         expected = identify_recording(job, joint(LENGTHS[k], k, stiffness=20.0 + k))[0]
         rows = windows.filter(pa.compute.equal(windows["recording"], f"r{k}.parquet")).sort_by("start_s")
@@ -467,10 +465,11 @@ def test_bad_manifests_are_refused(tmp_path: Path, manifest: str, why: str) -> N
         batch.run(parse_job(JOB), out=tmp_path / "out", manifest=tmp_path / "study.csv")
 
 
-def test_a_job_with_trials_is_refused(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("unchecked")
+def test_a_job_with_trials_is_refused() -> None:
     from dataclasses import replace
 
-    job = replace(parse_job(JOB), trials="anything")
+    job = replace(parse_job(JOB), trials="anything")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="trials"):
         make_plan(job, [])
 
