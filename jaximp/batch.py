@@ -299,8 +299,14 @@ def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: s
 
 
 def _environment() -> dict[str, str]:
-    """Of a worker: it keeps to its cores, and to float64."""
-    return {"JAX_ENABLE_X64": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    """Of a worker: float64, libraries that keep to its core, and the compiled code that is kept for the next run."""
+    import jax
+
+    settings = {"JAX_ENABLE_X64": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    folder = jax.config.read("jax_compilation_cache_dir") or os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if folder is not None:
+        settings |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+    return settings
 
 
 def _settle(number: int, workers: int) -> None:

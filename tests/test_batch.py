@@ -92,6 +92,14 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def kept_programs(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other processes keep what they compile, for the next one."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder / "jaximp"))
+
+
 def run(folder: Path, out: Path, **options: object) -> batch.Outcome:
     """The study's batch: of three lengths, and so three batches."""
     job = read_job(folder / "job.toml")
@@ -136,7 +144,7 @@ def assert_same(found: Estimates, expected: Estimates) -> None:
 
 
 CASES = {
-    "lengths and rates": ([joint(1000), joint(1321, 1, 251.3), joint(1390, 2, 250.001)], "", ""),
+    "lengths and rates": ([joint(1321, 1, 251.3), joint(1390, 2)], "", ""),
     "white noise": ([joint(1321)], "decimation_cutoff = 10", ""),
     "noise with a long memory": ([joint(1321, 2)], "decimation_cutoff = 10", "decimation_cutoff = 8\ndecimate = 1"),
     "steps that miss the next window": ([joint(1321)], "step = 0.05", "step = 0.036"),
@@ -225,7 +233,7 @@ def test_the_data_set_holds_what_identify_finds(study: Path) -> None:
 
     windows = ds.dataset(out / "estimates", format="parquet", partitioning="hive").to_table()
     assert set(windows["subject"].to_pylist()) == {"S1", "<script>alert(1)</script>", "../x", "S2", "..", "missing"}
-    for k in (0, 3, 7):
+    for k in (0, 2):
         expected = identify_recording(job, joint(LENGTHS[k], k, stiffness=20.0 + k))[0]
         rows = windows.filter(pa.compute.equal(windows["recording"], f"r{k}.parquet")).sort_by("start_s")
         np.testing.assert_allclose(rows["stiffness"], np.asarray(expected.fit.theta)[:, 2], 1e-9)
@@ -396,7 +404,7 @@ def test_another_job_or_another_content_is_computed_again(study: Path, tmp_path:
     run(folder, tmp_path / "out")
     save_recording(joint(LENGTHS[0], 99), folder / "r0.parquet")
     assert 0 < run(folder, tmp_path / "out", resume=True).skipped < 8
-    (folder / "job.toml").write_text(JOB.replace("length = 1", "length = 1.5"))
+    (folder / "job.toml").write_text(JOB + "\n[trust]\nmin_vaf = 0.8\n")
     assert run(folder, tmp_path / "out", resume=True).skipped == 0
 
 
@@ -486,7 +494,36 @@ def test_a_folder_that_is_there_is_not_touched(study: Path, tmp_path: Path) -> N
 # --- workers ----------------------------------------------------------------------------------------------------------
 
 
-def test_workers_give_the_same_bits(study: Path, tmp_path: Path) -> None:
+def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    assert run(study, tmp_path / "out", workers=2).exit_status == 0
+    import psutil
+
+    killed: list[psutil.Process] = []
+
+    def kill(event: dict[str, object]) -> None:
+        """`kill -9` of a worker, when the first batch is done and the others are under way."""
+        children = psutil.Process().children(recursive=True)
+        workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+        if event["event"] == "batch" and not killed:
+            addresses = {connection.laddr.ip for worker in workers for connection in worker.net_connections("inet")}
+            assert addresses <= {"127.0.0.1"}
+            killed.append(workers[0])
+            workers[0].kill()
+
+    assert run(study, tmp_path / "out", workers=2, tell=kill).exit_status == 0
+    assert killed
     assert content(tmp_path / "out") == content(study / "reference")
+    assert json.loads((tmp_path / "out/quarantine.json").read_text()) == []
+
+
+def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", str(study / "job.toml"), "--quiet"]
+    command += ["--manifest", str(study / "study.csv"), "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "out/batch.log").exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.terminate()
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + signal.SIGTERM, error
+    assert "Traceback" not in error
+    assert not list((tmp_path / "out").rglob(f"*{batch_results.UNFINISHED}"))
