@@ -22,17 +22,18 @@ from urllib.parse import quote
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from jaximp.batch_plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
 from jaximp.identify import Estimates, identify_recording, in_windows
 from jaximp.job import Job
-from jaximp.least_squares import SlidingFit
+from jaximp.least_squares import SlidingFit, confidence_interval
 from jaximp.models import Model
 from jaximp.pages import table_of, versions
 from jaximp.readers import RecordingError, count_samples
 from jaximp.recordings import recording_from_mapping
 from jaximp.regression import design_filters
-from jaximp.report import estimates_table, parameters_over_trusted
+from jaximp.report import estimates_table
 from jaximp.stacks import Measured, measure, solve_stack
 from jaximp.trust import VERDICTS, Verdicts
 from jaximp.types import Recording
@@ -335,35 +336,53 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     ]
     metadata = [dict(result.item.metadata) for result in results]
     columns += [(name, "", _texts(row.get(name, "") for row in metadata)) for name in task.metadata]
-    found = [result.recording for result in results]
+    measured = [result.recording for result in results]
     columns += [
         ("status", "", _texts(result.status for result in results)),
         ("reason", "", _texts(result.reason for result in results)),
-        ("samples", "1", np.array([0 if r is None else len(r) for r in found])),
-        ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in found)),
-        ("duration_s", "s", _numbers(r and r.time[-1] - r.time[0] for r in found)),
-        ("valid_share", "1", _numbers(r and r.valid.mean() for r in found)),
+        ("samples", "1", np.array([0 if r is None else len(r) for r in measured])),
+        ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in measured)),
+        ("duration_s", "s", _numbers(r and r.time[-1] - r.time[0] for r in measured)),
+        ("valid_share", "1", _numbers(r and r.valid.mean() for r in measured)),
         ("windows", "1", np.array([len(r.estimates[0].start) if r.estimates else 0 for r in results])),
     ]
     counts = [r.estimates[0].verdicts.counts() if r.estimates else dict.fromkeys(VERDICTS, 0) for r in results]
     columns += [(name, "1", np.array([count[name] for count in counts])) for name in VERDICTS]
     if model is not None:
-        parameters = [parameters_over_trusted(r.estimates[0]) if r.estimates else {} for r in results]
-        for name, unit in zip(model.names, model.units, strict=True):
-            for what in ("mean", "sd", "median_stderr", "half_width_95"):
-                values = _numbers(one.get(name, {}).get(what) for one in parameters)
-                columns.append((f"{name}_{what}", unit, values))
+        parameters = _over_trusted(results, len(model.names))
+        for k, (name, unit) in enumerate(zip(model.names, model.units, strict=True)):
+            columns += [(f"{name}_{what}", unit, _numbers(found[:, k])) for what, found in parameters.items()]
     columns += [
         ("threshold", "1", _numbers(r.estimates[0].threshold if r.estimates else None for r in results)),
         ("notes", "", _texts("\n".join(r.estimates[0].notes) if r.estimates else "" for r in results)),
         ("model", "", _texts("" if model is None else model.label for _ in results)),
-        ("filters", "", _texts(_filters(job, r) for r in found)),
+        ("filters", "", _texts(_filters(job, r) for r in measured)),
         ("versions", "", _texts([json.dumps(versions())] * len(results))),
         ("sha256", "", _texts(r.sha256 for r in results)),
         ("job_sha256", "", _texts([job_checksum(job)] * len(results))),
         ("seconds", "s", np.array([r.seconds for r in results])),
     ]
     return table_of(columns, job.text)
+
+
+def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.float64]]:
+    """(R, p) mean and spread of the parameters over the trusted windows of each recording.
+
+    Windows overlap, so that their mean is hardly surer than one of them: the interval, `mean - half_width_95` to `mean
+    + half_width_95`, is that of a window with the median standard error and degrees of freedom.
+    """
+    found = {what: np.full((len(results), p), np.nan) for what in ("mean", "sd", "median_stderr", "half_width_95")}
+    dof = np.full(len(results), np.nan)
+    for k, result in enumerate(results):
+        if result.estimates and result.estimates[0].verdicts.trusted.any():
+            fit, trusted = result.estimates[0].fit, result.estimates[0].verdicts.trusted
+            theta = np.asarray(fit.theta)[trusted]
+            found["mean"][k], found["sd"][k] = theta.mean(axis=0), theta.std(axis=0)
+            found["median_stderr"][k] = np.median(np.asarray(fit.stderr)[trusted], axis=0)
+            dof[k] = np.median(np.asarray(fit.dof)[trusted])
+    low, high = confidence_interval(0 * found["median_stderr"], found["median_stderr"], dof)
+    found["half_width_95"] = (high - low) / 2
+    return found
 
 
 def reserved_columns(job: Job) -> set[str]:

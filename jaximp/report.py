@@ -282,11 +282,6 @@ def _at_joint(estimates: Estimates, parts: list[_HumanPart]) -> dict[str, Any] |
     return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium, "reflex": reflex}
 
 
-def parameters_over_trusted(estimates: Estimates) -> dict[str, dict[str, Any]]:
-    """Mean, spread and median error of every parameter over the trusted windows; NaN where there are none."""
-    return _parameters(estimates, np.ones(len(estimates.names)))
-
-
 def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
     """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
     factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
