@@ -303,7 +303,7 @@ def _environment() -> dict[str, str]:
     import jax
 
     settings = {"JAX_ENABLE_X64": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    folder = jax.config.read("jax_compilation_cache_dir") or os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None) or os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is not None:
         settings |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     return settings
