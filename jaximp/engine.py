@@ -163,22 +163,26 @@ def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, n
         ends = around(0), around(window)
     first = _first_windows(blocked, plan, window, count)
 
-    def solve(sums: Rows, peak: Array, shift: Array | int) -> tuple[ChunkFit, Array]:
-        across = None if ends is None or noise is None else _across(ends, plan, shift, noise, p)
+    def solve(sums: Rows, peak: Array, outside: Outside | None, shift: Array | int) -> tuple[ChunkFit, Array]:
+        across = None if ends is None or outside is None else _across(ends, outside, plan, shift, p)
         return _solve(plan, p, R, sums, peak, noise, across), _for_prediction(sums, p, plan)
 
     def advance(
-        state: tuple[Rows, Array], step: tuple[Array, Array, Array]
-    ) -> tuple[tuple[Rows, Array], tuple[ChunkFit, Array]]:
-        sums, peak = state
+        state: tuple[Rows, Array, Outside | None], step: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Rows, Array, Outside | None], tuple[ChunkFit, Array]]:
+        sums, peak, outside = state
         leaving, entering, shift = keep(step)
-        found = solve(sums, peak, shift)
+        found = solve(sums, peak, outside, shift)
         for old, new in zip(leaving, entering, strict=True):
             sums = tuple(s - less + more for s, less, more in zip(sums, count(old), count(new), strict=True))
         sums = keep(sums)
-        return (sums, jnp.maximum(peak, _diagonal(sums, p))), found
+        if ends is not None and outside is not None and noise is not None:
+            for row in range(plan.step):
+                outside = _one_row_on(outside, ends, plan, shift + row, noise, p)
+        return (sums, jnp.maximum(peak, _diagonal(sums, p)), outside), found
 
-    state = first, _diagonal(first, p)
+    outside = None if ends is None or noise is None else _outside(ends, plan, noise, p)
+    state = first, _diagonal(first, p), outside
     if plan.per_block == 1:
         found, later = jax.tree.map(lambda x: x[None], solve(*state, 0))
         return _in_given_units(_with_unseen(found, later, R, plan), R, plan)
@@ -223,7 +227,8 @@ def solve_shortest(
     def fit_of(length: Array, total: Array) -> ChunkFit:
         sums, across = keep(tuple(jnp.split(total, split))), None
         if ends is not None and noise is not None:
-            across = _across((ends((plan.room - length) * plan.block), last), plan, 0, noise, p)
+            both = ends((plan.room - length) * plan.block), last
+            across = _across(both, _outside(both, plan, noise, p), plan, 0, p)
         return _solve(plan, p, R, sums, _diagonal(sums, p), noise, across)
 
     def unfinished(state: tuple[Array, Array, Array, ChunkFit]) -> Array:
@@ -424,23 +429,70 @@ def _ends(features: Array, plan: Plan, p: int) -> Callable[[Array | int], Array]
     return around
 
 
-def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Array, p: int) -> Rows:
+class Outside(NamedTuple):
+    """What rows outside of a window add to the convolutions of the rows inside, (reach, p + 1, lanes), nearest first.
+
+    The last of the p + 1 is that of the squared weights.
+    """
+
+    before: Array
+    behind: Array
+
+
+def _outside(ends: tuple[Array, Array], plan: Plan, noise: Array, p: int) -> Outside:
+    """Of the windows that begin with a block."""
+    kernels = _kernels(plan, noise)
+    distance = np.add.outer(np.arange(plan.reach), np.arange(plan.reach))
+    near = distance < plan.reach
+    hankels = [jnp.where(near, kernel[np.minimum(distance, plan.reach - 1)], 0) for kernel in kernels]
+
+    def added(rows: Array, mirrored: bool) -> Array:
+        outside = rows[plan.reach : 2 * plan.reach] if mirrored else rows[: plan.reach][::-1]
+        weighted = _weighted(outside, p)
+        columns, weights = jnp.tensordot(hankels[0], weighted[:, :p], 1), jnp.tensordot(hankels[1], weighted[:, p:], 1)
+        return keep(jnp.concatenate([columns, weights], 1))
+
+    return Outside(added(ends[0], False), added(ends[1], True))
+
+
+def _one_row_on(outside: Outside, ends: tuple[Array, Array], plan: Plan, shift: Array, noise: Array, p: int) -> Outside:
+    """The same for windows one row on: one row leaves them and is outside, one that was outside is in them."""
+    kernels = _kernels(plan, noise)
+    kernel = jnp.stack([*[kernels[0]] * p, kernels[1]], axis=1)[:, :, None]
+    leaving, entering = (_weighted(lax.dynamic_slice_in_dim(rows, shift + plan.reach, 1), p) for rows in ends)
+    next_ones = _weighted(lax.dynamic_slice_in_dim(ends[1], shift + 1 + plan.reach, plan.reach), p)
+    before = jnp.concatenate([outside.before[1:], jnp.zeros_like(leaving)]) + kernel * leaving
+    nearest = (kernel * next_ones).sum(axis=0, keepdims=True)
+    behind = jnp.concatenate([nearest, (outside.behind - kernel * entering)[:-1]])
+    return Outside(*keep((before, behind)))
+
+
+def _kernels(plan: Plan, noise: Array) -> tuple[Array, Array]:
+    """Autocovariance by distance in rows, from one to `reach`, and its square."""
+    distance = np.arange(1, plan.reach + 1)
+    kernel = jnp.where(distance % plan.outputs == 0, noise[distance // plan.outputs], 0)
+    return kernel, kernel**2
+
+
+def _weighted(rows: Array, p: int) -> Array:
+    """Columns times the root of their weight, and the weight, of rows [w u scale]."""
+    scale = rows[:, 2 * p :]
+    return jnp.concatenate([rows[:, :p] * scale, scale**2], 1)
+
+
+def _across(ends: tuple[Array, Array], outside: Outside, plan: Plan, shift: Array | int, p: int) -> Rows:
     """What the sums for coloured noise hold of pairs of rows of which only one is inside the window.
 
     Of the windows that begin `shift` rows behind a block's beginning, and in the order of `_products`.
     """
-    distance = np.add.outer(np.arange(plan.reach), np.arange(1, plan.reach + 1))
-    lag, aligned = distance // plan.outputs, distance % plan.outputs == 0
-    hankel = jnp.where(aligned & (lag < plan.lags), noise[np.minimum(lag, plan.lags - 1)], 0)
 
-    def lost(rows: Array, mirrored: bool) -> Array:
-        before = lax.dynamic_slice_in_dim(rows, shift, plan.reach)[::-1]
-        behind = lax.dynamic_slice_in_dim(rows, shift + plan.reach, plan.reach)
-        outside, inside = keep((behind, before) if mirrored else (before, behind))
-        scale, outer_scale = inside[:, 2 * p :], outside[:, 2 * p :]
-        from_columns = jnp.tensordot(hankel, outside[:, :p] * outer_scale, 1) * scale
-        from_weights = jnp.tensordot(hankel**2, outer_scale**2, 1) * scale**2
-        return jnp.concatenate([inside[:, :p], inside[:, p : 2 * p] - from_columns / 2, from_columns, from_weights], 1)
+    def lost(rows: Array, added: Array, mirrored: bool) -> Array:
+        start = shift if mirrored else shift + plan.reach
+        inside = lax.dynamic_slice_in_dim(rows, start, plan.reach)
+        inside = keep(inside[::-1] if mirrored else inside)
+        scale = inside[:, 2 * p :]
+        columns, weights = added[:, :p] * scale, added[:, p:] * scale**2
+        return jnp.concatenate([inside[:, :p], inside[:, p : 2 * p] - columns / 2, columns, weights], 1)
 
     def count(x: Array) -> Rows:
         w, u, e = x[:p], x[p : 2 * p], x[2 * p : 3 * p]
@@ -448,8 +500,8 @@ def _across(ends: tuple[Array, Array], plan: Plan, shift: Array | int, noise: Ar
         twice = tuple(u[i] * e[i:] + e[i] * u[i:] for i in range(p))
         return (*once, *twice, x[3 * p :])
 
-    beginning, end = ends
-    return _sum_of_rows(keep(jnp.concatenate([lost(beginning, False), lost(end, True)])), count)
+    both = lost(ends[0], outside.before, False), lost(ends[1], outside.behind, True)
+    return _sum_of_rows(keep(jnp.concatenate(both)), count)
 
 
 def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Rows | None) -> ChunkFit:
