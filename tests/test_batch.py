@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jaximp import batch, batch_results, stacks
+from jaximp import batch, batch_plan, batch_results, stacks, windows
 from jaximp.batch_plan import find_items, make_plan, padded_sizes
 from jaximp.identify import Estimates, identify_recording, in_windows
 from jaximp.job import Job, parse_job, read_job
@@ -264,6 +264,39 @@ def test_every_reader_reads_it(study: Path, reader: str) -> None:
         subjects = {subject for (subject,) in library.sql(f"SELECT DISTINCT subject FROM {where}").fetchall()}
     assert counts == expected
     assert {"S1", "S2", "../x", "..", "<script>alert(1)</script>"} <= subjects
+
+
+def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
+    """One by one, with the recording of the robot alone that the manifest names."""
+    text = JOB.replace("human = true", "human = true\nrobot = { gravity = false, coulomb = false }\nmethods = [1, 3]")
+    text += '[robot_recording]\nfile = "none.parquet"\n' + "".join(JOB.splitlines(keepends=True)[3:6])
+    save_recording(joint(1000, 1), tmp_path / "held.parquet")
+    save_recording(joint(1000, 2, stiffness=0.0), tmp_path / "alone.parquet")
+    (tmp_path / "study.csv").write_text("file,robot_file\nheld.parquet,alone.parquet\n")
+    job = parse_job(text, tmp_path)
+    plan = make_plan(job, find_items([], tmp_path / "study.csv"))
+    assert any("one by one" in line for line in plan.in_words(job))
+    outcome = batch.run_plan(job, plan, tmp_path / "out")
+    assert outcome.failed == []
+    expected = identify_recording(job, joint(1000, 1), joint(1000, 2, stiffness=0.0))
+    for folder, one in zip(("estimates", "estimates_method3"), expected, strict=True):
+        (path,) = (tmp_path / "out" / folder).rglob("*.parquet")
+        np.testing.assert_allclose(pq.ParquetFile(path).read()["stiffness"], np.asarray(one.fit.theta)[:, 2], 1e-12)
+
+
+def test_a_long_recording_goes_in_chunks_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is too long to be stacked gives what `identify` gives, which solves it in overlapping chunks."""
+    monkeypatch.setattr(batch_plan, "LONGEST_STACKED", 1200)
+    monkeypatch.setattr(windows, "FROM_CHUNKS", 1)
+    save_recording(joint(1321), tmp_path / "long.parquet")
+    save_recording(joint(1000), tmp_path / "short.parquet")
+    job = parse_job(JOB, tmp_path)
+    plan = make_plan(job, find_items([str(tmp_path)]))
+    assert [one.padded for one in plan.batches] == [1000, 0]
+    assert batch.run_plan(job, plan, tmp_path / "out").exit_status == 0
+    found = pq.ParquetFile(tmp_path / "out/estimates/batch-00001.parquet").read()
+    expected = identify_recording(job, joint(1321))[0]
+    np.testing.assert_array_equal(found["stiffness"], np.asarray(expected.fit.theta)[:, 2])
 
 
 # --- faults -----------------------------------------------------------------------------------------------------------
