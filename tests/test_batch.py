@@ -464,6 +464,21 @@ def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert dict(zip(table["recording"].to_pylist(), table["status"].to_pylist(), strict=True))["good.parquet"] == "ok"
 
 
+@pytest.mark.parametrize(("reports", "expected"), [("none", []), ("failed", ["noise"]), ("all", ["good", "noise"])])
+def test_reports_are_those_that_were_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reports: str, expected: list[str]
+) -> None:
+    """A recording has failed if none of its windows can be trusted."""
+    written: list[str] = []
+    monkeypatch.setattr(batch_results, "write_report_of", lambda job, one, alone, folder: written.append(one.name))
+    good = joint(1000)
+    torque = np.random.default_rng(0).normal(size=(1000, 1))
+    save_recording(good, tmp_path / "good.parquet")
+    save_recording(recording_from_arrays(good.time, good.position, torque), tmp_path / "noise.parquet")
+    assert batch.run(parse_job(JOB), [tmp_path], tmp_path / "out", reports=reports).exit_status == 0
+    assert sorted(written) == expected
+
+
 # --- what a manifest may not do ---------------------------------------------------------------------------------------
 
 
@@ -560,3 +575,5 @@ def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
     assert process.returncode == 128 + signal.SIGTERM, error
     assert "Traceback" not in error
     assert not list((tmp_path / "out").rglob(f"*{batch_results.UNFINISHED}"))
+    assert run(study, tmp_path / "out", resume=True).exit_status == 0
+    assert content(tmp_path / "out") == content(study / "reference")
