@@ -28,7 +28,7 @@ from jaximp.batch_plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, 
 from jaximp.identify import Estimates, identify_recording, in_windows
 from jaximp.job import Job
 from jaximp.least_squares import SlidingFit, confidence_interval
-from jaximp.models import Model
+from jaximp.models import Joints, Model, pathway_of
 from jaximp.pages import table_of, versions
 from jaximp.readers import RecordingError, count_samples
 from jaximp.recordings import recording_from_mapping
@@ -43,6 +43,8 @@ UNFINISHED = ".unfinished"
 RUN_COLUMNS = ("seconds",)
 """Columns of the recordings' table that differ from run to run."""
 OK, FAILED = "ok", "failed"
+ANY_RATE = 1000.0
+"""Of recordings that could not be read [Hz]: a model's names do not depend on it."""
 
 _one_at_a_time = Lock()
 """What may use LAPACK or draws figures: two such programs at a time can block each other."""
@@ -304,7 +306,7 @@ def windows_table(job: Job, results: Sequence[Result], k: int = 0) -> pa.Table:
     several = [result.estimates[k] for result in results]
     recording = results[0].recording
     assert recording is not None
-    human = job.models(recording.joints)[1]
+    human = job.models(recording.joints, recording.sample_rate)[1]
     table = estimates_table(_one_after_another(several), human, job)
     names = pa.array(np.repeat([result.item.name for result in results], [len(one.start) for one in several]))
     return table.add_column(0, pa.field("recording", pa.string(), metadata={"unit": ""}), names.cast(pa.string()))
@@ -324,12 +326,22 @@ def _one_after_another(several: Sequence[Estimates]) -> Estimates:
         fit=SlidingFit(**fit),
         held_out_vaf=joined([e.held_out_vaf for e in several]),
         verdicts=Verdicts(joined([e.verdicts.verdict for e in several]), joined([e.verdicts.reason for e in several])),
+        reflexes=tuple(
+            replace(
+                reflex,
+                gain=joined([e.reflexes[k].gain for e in several]),
+                gain_stderr=joined([e.reflexes[k].gain_stderr for e in several]),
+                delay=joined([e.reflexes[k].delay for e in several]),
+            )
+            for k, reflex in enumerate(several[0].reflexes)
+        ),
     )
 
 
 def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     """One row per recording: where it comes from, what was found, and what made it."""
     job, model = task.job, _model_of(task.job, results)
+    named = [] if model is None else _summarised(model)
     columns: list[tuple[str, str, Any]] = [
         ("recording", "", _texts(result.item.name for result in results)),
         ("file", "", _texts(str(result.item.file) for result in results)),
@@ -348,10 +360,9 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     ]
     counts = [r.estimates[0].verdicts.counts() if r.estimates else dict.fromkeys(VERDICTS, 0) for r in results]
     columns += [(name, "1", np.array([count[name] for count in counts])) for name in VERDICTS]
-    if model is not None:
-        parameters = _over_trusted(results, len(model.names))
-        for k, (name, unit) in enumerate(zip(model.names, model.units, strict=True)):
-            columns += [(f"{name}_{what}", unit, _numbers(found[:, k])) for what, found in parameters.items()]
+    parameters = _over_trusted(results, len(named))
+    for k, (name, unit) in enumerate(named):
+        columns += [(f"{name}_{what}", unit, _numbers(found[:, k])) for what, found in parameters.items()]
     columns += [
         ("threshold", "1", _numbers(r.estimates[0].threshold if r.estimates else None for r in results)),
         ("notes", "", _texts("\n".join(r.estimates[0].notes) if r.estimates else "" for r in results)),
@@ -369,13 +380,14 @@ def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.flo
     """(R, p) mean and spread of the parameters over the trusted windows of each recording.
 
     Windows overlap, so that their mean is hardly surer than one of them: the interval, `mean - half_width_95` to `mean
-    + half_width_95`, is that of a window with the median standard error and degrees of freedom.
+    + half_width_95`, is that of a window with the median standard error and degrees of freedom. Of a reflex it is the
+    gain.
     """
     found = {what: np.full((len(results), p), np.nan) for what in ("mean", "sd", "median_stderr", "half_width_95")}
     dof = np.full(len(results), np.nan)
     for k, result in enumerate(results):
         if result.estimates and result.estimates[0].verdicts.trusted.any():
-            fit, trusted = result.estimates[0].fit, result.estimates[0].verdicts.trusted
+            fit, trusted = result.estimates[0].summarised().fit, result.estimates[0].verdicts.trusted
             theta = np.asarray(fit.theta)[trusted]
             found["mean"][k], found["sd"][k] = theta.mean(axis=0), theta.std(axis=0)
             found["median_stderr"][k] = np.median(np.asarray(fit.stderr)[trusted], axis=0)
@@ -393,17 +405,33 @@ def reserved_columns(job: Job) -> set[str]:
 
 def _model_of(job: Job, results: Sequence[Result]) -> Model | None:
     """What is identified: of the recordings that could be read, or as the job's columns suggest."""
-    joints = next((result.recording.joints for result in results if result.recording is not None), None)
+    first = next((result.recording for result in results if result.recording is not None), None)
+    joints = None if first is None else first.joints
+    rate = ANY_RATE if first is None else first.sample_rate
     if joints is None:
         position, joint = job.recording.get("position"), job.recording.get("joint", "revolute")
         position = position.get("column") if isinstance(position, Mapping) else position
         n = 1 if isinstance(position, str) else len(position or "1")
         joints = tuple(joint) if isinstance(joint, list) else (joint,) * n
     try:
-        robot, human = job.models(joints)
+        robot, human = job.models(joints, rate)
     except (ValueError, KeyError):
         return None
     return robot if human is None else human
+
+
+def _summarised(model: Model) -> list[tuple[str, str]]:
+    """Name and unit of what a recording's row tells, in the order of `Estimates.summarised`."""
+    parts = model.models if isinstance(model, Joints) else (model,)
+    tags = [f"joint{j + 1}." if isinstance(model, Joints) else "" for j in range(len(parts))]
+    kept, gains = list[tuple[str, str]](), list[tuple[str, str]]()
+    for tag, part in zip(tags, parts, strict=True):
+        weights = pathway_of(part).columns if part.memory else ()
+        units = dict(zip(part.columns, part.units, strict=True))
+        named = zip(part.names, part.columns, strict=True)
+        kept += [(tag + name, units[column]) for name, column in named if column not in weights]
+        gains += [(f"{tag}reflex_gain", units[weights[0]])] if weights else []
+    return [*kept, *gains]
 
 
 def _filters(job: Job, recording: Recording | None) -> str:

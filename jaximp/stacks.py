@@ -63,6 +63,8 @@ def stackable(job: Job) -> str:
         return "filter.mode = 'window' filters inside every window"
     if job.model.robot is not None and job.model.human is not None:
         return "a human in a robot needs two recordings at a time"
+    if job.model.human is not None and job.model.human.reflex:
+        return "a reflex remembers the past, and its gain is a fit of its own"
     return ""
 
 

@@ -284,6 +284,35 @@ def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
         np.testing.assert_allclose(pq.ParquetFile(path).read()["stiffness"], np.asarray(one.fit.theta)[:, 2], 1e-12)
 
 
+@pytest.mark.parametrize("n_joints", [1, 2])
+def test_a_reflex_is_what_it_is_alone(tmp_path: Path, n_joints: int) -> None:
+    """Recordings of two rates in one table, with gain and delay of every window and the gain in the row of each."""
+    text = JOB.replace("human = true", "human = { reflex = { first = 0.05, last = 0.25, count = 3 } }")
+    text = text.replace("length = 1\n", "length = 2\n").replace("step = 0.05", "step = 0.2")
+    both = {"a": joint(1000, 1), "b": joint(1300, 2, rate=300.0)}
+    if n_joints == 2:
+        both = {name: beside(one, joint(len(one), 7, one.sample_rate)) for name, one in both.items()}
+        text = text.replace('"position_rad"', '["position1_rad", "position2_rad"]')
+        text = text.replace('"torque_Nm"', '["torque1_Nm", "torque2_Nm"]')
+    for name, one in both.items():
+        save_recording(one, tmp_path / f"{name}.parquet")
+    (tmp_path / "study.csv").write_text("file,subject\na.parquet,S\nb.parquet,S\n")
+    job = parse_job(text, tmp_path)
+    assert batch.run(job, out=tmp_path / "out", manifest=tmp_path / "study.csv").exit_status == 0
+    alone = [identify_recording(job, one)[0] for one in both.values()]
+    (path,) = (tmp_path / "out/estimates").rglob("*.parquet")
+    found, rows = pq.ParquetFile(path).read(), batch.read_recordings(tmp_path / "out")
+    for k, reflex in enumerate(alone[0].reflexes):
+        for what in ("gain", "gain_stderr", "delay"):
+            expected = np.concatenate([getattr(one.reflexes[k], what) for one in alone])
+            np.testing.assert_allclose(found[f"{reflex.name}_{what}"], expected, 1e-12)
+    means = [one.summarised().mean_over_trusted() for one in alone]
+    for k, name in enumerate(alone[0].summarised().names):
+        np.testing.assert_allclose(rows[f"{name}_mean"].to_numpy(), [mean[k] for mean in means], 1e-12)
+    assert f"{alone[0].reflexes[-1].name}_gain_mean" in rows.column_names
+    assert np.isfinite(rows[f"{alone[0].names[2]}_mean"].to_numpy()).all()
+
+
 def test_a_long_recording_goes_in_chunks_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is too long to be stacked gives what `identify` gives, which solves it in overlapping chunks."""
     monkeypatch.setattr(batch_plan, "LONGEST_STACKED", 1200)
