@@ -18,7 +18,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("studies",),
     ("batch",),
     ("batch_results",),
-    ("report", "impedance_report", "posterior_report", "check"),
+    ("report", "impedance_report", "posterior_report", "overview", "check"),
     ("pages",),
     ("plots",),
     ("batch_plan",),
