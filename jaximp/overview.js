@@ -173,7 +173,7 @@
       const wide = width(one);
       total += wide;
       const group = document.createElement("col");
-      group.style.width = `${wide}ch`;
+      group.style.width = one.name === "recording" ? `min(${wide}ch, 45vw)` : `${wide}ch`; // it stays when the rest scrolls
       table.querySelector("colgroup").append(group);
       const head = element("th", "", one.kind === "text" ? "" : "number");
       head.scope = "col";
@@ -311,7 +311,7 @@
     const x = (time) => +(LEFT + (WIDTH - LEFT - RIGHT) * (time - begin) / (end - begin || 1)).toFixed(1);
     const place = (value) => HEIGHT - BOTTOM - (HEIGHT - BOTTOM - TOP) * (value - low) / (high - low);
     const y = (value) => +keep(place(value), TOP, HEIGHT - BOTTOM).toFixed(1);
-    const image = drawn("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, "aria-hidden": "true" });
+    const image = drawn("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, "aria-hidden": "true", preserveAspectRatio: "xMinYMid" });
     for (const tick of ticks(low, high)) {
       image.append(drawn("path", { class: "grid", d: `M${LEFT} ${y(tick)}H${WIDTH - RIGHT}` }));
       const label = drawn("text", { x: LEFT - 4, y: y(tick) + 3.5, "text-anchor": "end" });
@@ -356,7 +356,7 @@
   }
 
   function panelSpace() {
-    const whole = element("div");
+    const whole = element("div", "", "space");
     return { whole, height: (pixels) => { whole.style.height = `${pixels}px`; } };
   }
 
