@@ -144,7 +144,7 @@ def test_groups_come_in_order_and_without_a_value_last() -> None:
 
 
 def test_the_intervals_hold_what_they_promise() -> None:
-    """Subjects differ, and each has several recordings: an interval over recordings would hold the mean far too rarely."""
+    """Subjects differ, and have several recordings each: intervals over recordings hold the mean far too rarely."""
     rng = np.random.default_rng(0)
     held = {"subject": 0, "person": 0}
     for _ in range(300):
@@ -309,7 +309,11 @@ def visit(page: Browser, path: Path, fragment: str = "") -> None:
 
 def rows(page: Browser) -> list[str]:
     """Names of the recordings whose rows are in the page."""
-    found: list[str] = page.evaluate("[...document.querySelectorAll('#table tbody th')].map(cell => cell.textContent)")
+    return texts(page, "#table tbody th")
+
+
+def texts(page: Browser, selector: str) -> list[str]:
+    found: list[str] = page.evaluate(f"[...document.querySelectorAll('{selector}')].map(one => one.textContent)")
     return found
 
 
@@ -335,15 +339,13 @@ def test_table_shows_rows_and_makes_only_those_in_view(page: Browser) -> None:
 
 def test_nasty_texts_are_texts(page: Browser) -> None:
     assert page.evaluate("document.querySelector('h1').textContent") == f"Study of {NASTY}"
-    cells = page.evaluate(
-        "[...document.querySelectorAll('#table tbody tr:nth-child(2) td')].map(one => one.textContent)"
-    )
+    cells = texts(page, "#table tbody tr:nth-child(2) td")
     assert NASTY in cells
-    choices = page.evaluate("[...document.querySelectorAll('#filters option')].map(one => one.textContent)")
+    choices = texts(page, "#filters option")
     assert NASTY in choices
     page.evaluate("document.getElementById('show-failures').click()")
     page.frame()
-    reasons = page.evaluate("[...document.querySelectorAll('#table tbody td')].map(one => one.textContent)")
+    reasons = texts(page, "#table tbody td")
     assert reasons.count(REASON) == 5
     assert page.evaluate("document.querySelectorAll('img').length") == 0
 
@@ -425,14 +427,12 @@ def test_panels_are_drawn_when_somebody_comes_near(page: Browser) -> None:
 def test_each_panel_can_have_its_own_scale(page: Browser) -> None:
     page.evaluate("document.getElementById('panels').scrollIntoView()")
     page.wait("document.querySelectorAll('.panel svg').length")
-    labels = (
-        "[...document.querySelectorAll('.panel svg')].slice(0, 2).map(one => one.querySelector('text').textContent)"
-    )
-    first, second = page.evaluate(labels)
+    lowest = ".panel text:first-of-type"
+    first, second = texts(page, lowest)[:2]
     assert first == second
     page.evaluate("document.querySelector('[value=own]').click()")
     page.frame()
-    first, second = page.evaluate(labels)
+    first, second = texts(page, lowest)[:2]
     assert (float(first), float(second)) == (0, 1)
     heights = page.evaluate("document.querySelector('.panel .trusted').getAttribute('d')")
     rising = [float(y) for y in re.findall(r"L[\d.]+ ([\d.]+)", heights)]
@@ -445,7 +445,7 @@ def test_panels_follow_the_table_and_say_what_failed(page: Browser) -> None:
     page.wait("document.querySelectorAll('.panel svg').length")
     page.evaluate("document.getElementById('show-failures').click()")
     page.frame()
-    panels = page.evaluate("[...document.querySelectorAll('.panel')].map(one => one.textContent)")
+    panels = texts(page, ".panel")
     assert panels == [f"trial {k}failed: {REASON}" for k in range(N - 5, N)]
 
 
@@ -461,9 +461,11 @@ def test_the_policy_stops_scripts_and_requests(running: Browser, path: Path) -> 
     """Were a text ever to become markup, the browser would still refuse to run or fetch anything for it."""
     visit(running, path)
     running.evaluate(
-        "(() => { window.stopped = []; addEventListener('securitypolicyviolation', (e) => stopped.push(e.effectiveDirective));"
-        "const script = document.createElement('script'); script.textContent = 'window.ran = 4'; document.body.append(script);"
-        "const image = document.createElement('img'); image.src = 'http://127.0.0.1:9/'; document.body.append(image);"
+        "(() => { window.stopped = [];"
+        "addEventListener('securitypolicyviolation', (event) => stopped.push(event.effectiveDirective));"
+        "const add = (name, about) => document.body.append(Object.assign(document.createElement(name), about));"
+        "add('script', { textContent: 'window.ran = 4' });"
+        "add('img', { src: 'http://127.0.0.1:9/' });"
         "fetch('http://127.0.0.1:9/').catch(() => 0); })()"
     )
     running.wait("stopped.length >= 3")
