@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,23 +19,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from jaximp.batch_plan import Batch, Item, Plan, find_items, make_plan
 from jaximp.batch_results import (
+    RUN_COLUMNS,
     UNFINISHED,
     Interrupted,
     Task,
     finished,
     receipt_path,
+    report_folder,
+    report_wanted,
     reserved_columns,
     solve_batch,
+    write_late_report,
     write_whole,
 )
 from jaximp.chunks import cores
 from jaximp.job import Job
 from jaximp.outputs import MARK
+from jaximp.overview import Series, thinned, write_overview
+from jaximp.plots import main_parameter
 from jaximp.signals import require_float64
+from jaximp.trust import TRUSTED
 
 Tell = Callable[[dict[str, Any]], None]
 """Called with what happens: `{"event": "batch", "done": 64, ...}`."""
@@ -42,6 +52,14 @@ Tell = Callable[[dict[str, Any]], None]
 FOLDERS = ("estimates", "recordings", "receipts", "reports")
 IN_FLIGHT = 2
 """Batches that are handed out per worker: one is solved while the next one waits."""
+PAGE = "overview.html"
+HIDDEN = (
+    "samples", "sample_rate_hz", "threshold", "notes", "model", "filters", "versions", "sha256", "job_sha256",
+    *RUN_COLUMNS,
+)  # fmt: skip
+"""Columns of the recordings that the page leaves out."""
+MOST_GROUPS = 100
+"""Groups whose means the page tells; more are no comparison."""
 
 
 @dataclass
@@ -74,7 +92,7 @@ def run(
     workers: int = 0,
     scheduler: str | None = None,
     resume: bool = False,
-    reports: str = "none",
+    reports: str | Sequence[str] = "none",
     tell: Tell = lambda event: None,
 ) -> Outcome:
     """Identify many recordings by one job.
@@ -82,7 +100,8 @@ def run(
     **Arguments:** `files` recordings, patterns or folders, or else a `manifest` (`batch_plan.find_items`); `out` the
     folder of the results; `partitions` the manifest's columns that results are partitioned by; `workers` processes on
     this machine, or the address of a Dask `scheduler`, whose workers see the same files; `resume` takes up a run that
-    was broken off; `reports` of `all` recordings, of those `failed` (without a trusted window), or `none`.
+    was broken off; `reports` of `all` recordings, of those `failed` (without a trusted window), of `none`, or of those
+    with these names: with `resume` they are written of recordings that are done, too.
 
     **Raises:** `ValueError` for what cannot be begun; `KeyboardInterrupt` ends cleanly.
     """
@@ -97,15 +116,16 @@ def run_plan(
     workers: int = 0,
     scheduler: str | None = None,
     resume: bool = False,
-    reports: str = "none",
+    reports: str | Sequence[str] = "none",
     tell: Tell = lambda event: None,
 ) -> Outcome:
     """As `run`, for a plan that is made."""
     require_float64()
     out = Path(os.path.abspath(out))
     check_metadata(job, plan)
+    chosen = _checked_reports(reports, plan)
     _prepare_folder(out, resume, plan.items)
-    task, outcome = Task.of(job, plan, out, reports), Outcome(recordings=len(plan.items))
+    task, outcome = Task.of(job, plan, out, chosen), Outcome(recordings=len(plan.items))
     with _log(out, tell) as log:
         log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
         left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
@@ -122,6 +142,8 @@ def run_plan(
                 done += len(batch.items)
                 for failed in found["failed"]:
                     log({"event": "failed", **failed})
+                for name, why in found["run"]["without_report"].items():
+                    log({"event": "no report", "recording": name, "reason": why})
                 rate = (done - outcome.skipped) / max(time.perf_counter() - begin, 1e-9)
                 log(
                     {"event": "batch", "batch": batch.number, "done": done, "of": len(plan.items),
@@ -132,11 +154,28 @@ def run_plan(
             raise
         outcome.failed.sort(key=lambda failed: str(failed["recording"]))
         write_whole(out / "quarantine.json", (json.dumps(outcome.failed, indent=1) + "\n").encode())
+        try:
+            if len(outcome.broken) < len(plan.batches):
+                earlier = {item for batch in {*plan.batches} - {*left} for item in batch.items}
+                _write_late_reports(task, sorted(earlier, key=lambda item: item.name), log)
+                write_page(out, plan.metadata, plan.partitions)
+        except OSError as error:
+            outcome.broken.append(f"{PAGE}: {error.strerror or error}")
         log(
             {"event": "done", "recordings": outcome.recordings, "windows": outcome.windows, "trusted": outcome.trusted,
              "failed": len(outcome.failed), "skipped": outcome.skipped, "broken": len(outcome.broken)}
         )  # fmt: skip
     return outcome
+
+
+def _checked_reports(reports: str | Sequence[str], plan: Plan) -> str | tuple[str, ...]:
+    if isinstance(reports, str) and reports in ("all", "failed", "none"):
+        return reports
+    names = (reports,) if isinstance(reports, str) else tuple(reports)
+    for name in names:
+        if name not in {item.name for item in plan.items}:
+            raise ValueError(f"there is no recording '{name}' to report: give all, failed, none or a recording's name")
+    return names
 
 
 def check_metadata(job: Job, plan: Plan) -> None:
@@ -177,6 +216,8 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
     for batch, receipt in zip(plan.batches, receipts, strict=True):
         if receipt is None:
             left.append(batch)
+            for item in batch.items:  # what was reported may be of another content
+                shutil.rmtree(report_folder(task.out, item.name), ignore_errors=True)
             continue
         kept |= {receipt_path(task.out, batch), *(task.out / name for name in receipt["outputs"])}
         _take_up(outcome, receipt)
@@ -343,4 +384,66 @@ def read_recordings(out: str | Path) -> pa.Table:
     return pa.concat_tables(tables, promote_options="permissive").sort_by("recording")
 
 
-__all__ = ["Interrupted", "Outcome", "find_items", "make_plan", "read_recordings", "run", "run_plan"]
+def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[str] = ()) -> None:
+    """The overview of a finished batch (`overview.write_overview`), with links to the reports that there are.
+
+    **Arguments:** `metadata` the manifest's columns, whose empty values are not known; `groups` those whose values are
+    compared. Subjects are none: they are what is averaged.
+    """
+    out = Path(out)
+    table = read_recordings(out)
+    table = table.select([name for name in table.column_names if name not in HIDDEN and not _is_detail(name)])
+    for name in metadata:
+        place, texts = table.column_names.index(name), table[name].to_pylist()
+        table = table.set_column(
+            place, table.schema.field(name), pa.array([text or None for text in texts], pa.string())
+        )
+    groups = [name for name in groups if name != "subject"]
+    if groups and len(set(zip(*(table[name].to_pylist() for name in groups), strict=True))) > MOST_GROUPS:
+        groups = []
+    parameters = [name.removesuffix("_mean") for name in table.column_names if name.endswith("_mean")]
+    reports = {name: report_folder(out, name) / "report.html" for name in table["recording"].to_pylist()}
+    links = {name: file.relative_to(out).as_posix() for name, file in reports.items() if file.is_file()}
+    series = _series(out, main_parameter(parameters)) if parameters else {}
+    unfinished = out / f".{PAGE}{UNFINISHED}"
+    try:
+        write_overview(unfinished, table, series, groups, links)
+        os.replace(unfinished, out / PAGE)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _is_detail(name: str) -> bool:
+    return name.endswith(("_median_stderr", "_half_width_95"))
+
+
+def _series(out: Path, parameter: str) -> dict[str, Series]:
+    """One parameter of every recording over time, as much of it as a panel shows; file by file."""
+    found: dict[str, Series] = {}
+    for file in sorted((out / "estimates").rglob("batch-*.parquet")):
+        table = pq.ParquetFile(file).read(columns=["recording", "end_s", parameter, "verdict"])
+        names = table["recording"].to_numpy()
+        ends, values = (table[name].to_numpy() for name in ("end_s", parameter))
+        trusted = table["verdict"].to_numpy() == TRUSTED
+        ends_of = np.flatnonzero(np.r_[names[1:] != names[:-1], True]) + 1
+        for begin, end in zip([0, *ends_of[:-1]], ends_of, strict=True):
+            one = slice(begin, end)
+            found[str(names[begin])] = thinned(Series(ends[one], values[one], trusted[one]))
+    return found
+
+
+def _write_late_reports(task: Task, items: Sequence[Item], log: Tell) -> None:
+    """Reports of recordings that were identified by an earlier run."""
+    if task.reports == "none" or not items:
+        return
+    rows = read_recordings(task.out)
+    counts = zip(*(rows[name].to_pylist() for name in ("recording", "windows", TRUSTED)), strict=True)
+    wanted = {name for name, windows, trusted in counts if report_wanted(task, name, windows, trusted)}
+    for item in items:
+        if item.name in wanted and not (report_folder(task.out, item.name) / "report.html").is_file():
+            why = write_late_report(task, item)
+            if why:
+                log({"event": "no report", "recording": item.name, "reason": why})
+
+
+__all__ = ["Interrupted", "Outcome", "find_items", "make_plan", "read_recordings", "run", "run_plan", "write_page"]

@@ -63,11 +63,11 @@ class Task:
     metadata: tuple[str, ...]
     partitions: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
-    reports: str = "none"
-    """`all`, `failed` (recordings without a trusted window) or `none`."""
+    reports: str | tuple[str, ...] = "none"
+    """`all`, `failed` (recordings without a trusted window), `none`, or the names of some."""
 
     @classmethod
-    def of(cls, job: Job, plan: Plan, out: Path, reports: str = "none") -> Task:
+    def of(cls, job: Job, plan: Plan, out: Path, reports: str | tuple[str, ...] = "none") -> Task:
         return cls(job, out, plan.metadata, plan.partitions, plan.sizes, reports)
 
     def key(self, batch: Batch) -> str:
@@ -132,7 +132,7 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
     _solve(task, batch, results)
     if stopped():
         raise Interrupted
-    _write_reports(task, results)
+    unwritten = _write_reports(task, results)
     outputs = _write_tables(task, batch, results)
     receipt = {
         "batch": batch.number,
@@ -142,7 +142,7 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
         "failed": [failure(result.item, result.reason) for result in results if result.status == FAILED],
         "windows": sum(len(result.estimates[0].start) for result in results if result.estimates),
         "trusted": sum(int(result.estimates[0].verdicts.trusted.sum()) for result in results if result.estimates),
-        "run": {"seconds": time.perf_counter() - begin},
+        "run": {"seconds": time.perf_counter() - begin, "without_report": unwritten},
     }
     write_whole(receipt_path(task.out, batch), (json.dumps(receipt, indent=1) + "\n").encode())
     return receipt
@@ -461,18 +461,40 @@ def report_folder(out: Path, name: str) -> Path:
     return out / "reports" / (plain if len(plain) < 200 else checksum(name.encode()))
 
 
-def _write_reports(task: Task, results: Sequence[Result]) -> None:
-    """The reports that were asked for, as `identify` writes them."""
+def report_wanted(task: Task, name: str, windows: int, trusted: int) -> bool:
+    """Whether a recording gets a report; of one that could not be identified there is none."""
+    if not windows or isinstance(task.reports, tuple):
+        return windows > 0 and name in task.reports
+    return task.reports == "all" or (task.reports == "failed" and not trusted)
+
+
+def _write_reports(task: Task, results: Sequence[Result]) -> dict[str, str]:
+    """The reports that were asked for, as `identify` writes them; why there is none of some recordings."""
+    unwritten: dict[str, str] = {}
     for result in results:
-        wanted = task.reports == "all" or (
-            task.reports == "failed" and bool(result.estimates) and not result.estimates[0].verdicts.trusted.any()
-        )
-        if not wanted or not result.estimates or result.recording is None:
+        if result.recording is None or not result.estimates:
             continue
-        with _one_at_a_time:
-            write_report_of(
-                task.job, result.recording, _alone(task, result.item), report_folder(task.out, result.item.name)
-            )
+        trusted = result.estimates[0].verdicts.trusted
+        if report_wanted(task, result.item.name, len(trusted), int(trusted.sum())):
+            why = _write_report(task, result.item, result.recording)
+            unwritten |= {result.item.name: why} if why else {}
+    return unwritten
+
+
+def write_late_report(task: Task, item: Item) -> str:
+    """The report of a recording that was identified before, and nothing; or why there is none."""
+    found = Result(item)
+    with _reasons(found):
+        found.recording = _load(task.job.recording, item.file, task.job.folder)
+    return found.reason if found.recording is None else _write_report(task, item, found.recording)
+
+
+def _write_report(task: Task, item: Item, recording: Recording) -> str:
+    """Nothing, or why it could not be written: a report that fails must not cost a batch."""
+    found = Result(item)
+    with _one_at_a_time, _reasons(found):
+        write_report_of(task.job, recording, _alone(task, item), report_folder(task.out, item.name))
+    return found.reason
 
 
 def write_report_of(job: Job, recording: Recording, alone: Recording | None, folder: Path) -> None:

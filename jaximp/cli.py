@@ -62,14 +62,6 @@ class Format(StrEnum):
     csv = "csv"
 
 
-class Reports(StrEnum):
-    """Which recordings of a batch get a report of their own."""
-
-    all = "all"
-    failed = "failed"
-    none = "none"
-
-
 class Paper(StrEnum):
     """What can be reproduced."""
 
@@ -258,7 +250,10 @@ def batch(
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Take up a run that was broken off.")] = False,
-    reports: Annotated[Reports, typer.Option("--reports", help="Which recordings get a report.")] = Reports.none,
+    reports: Annotated[
+        list[str] | None,
+        typer.Option("--reports", help="all, failed, none, or a recording's name (many times): which get a report."),
+    ] = None,
     partition: Annotated[list[str] | None, typer.Option("--partition", help="Column of the manifest.")] = None,
     allow_outside: Annotated[bool, typer.Option("--allow-outside", help="A manifest may name any path.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but what failed.")] = False,
@@ -266,8 +261,9 @@ def batch(
 ) -> None:
     """Identify many recordings by one job, on all cores or on a cluster.
 
-    Writes a Parquet data set: estimates (a row per window) and recordings (a row each). What fails is listed in
-    quarantine.json, and the rest goes on; the exit status is 3 then. A run that was broken off goes on with --resume.
+    Writes a Parquet data set, estimates (a row per window) and recordings (a row each), and overview.html over all of
+    them. What fails is listed in quarantine.json, and the rest goes on; the exit status is 3 then. A run that was
+    broken off goes on with --resume, which also writes reports that are asked for later.
     """
     from jaximp.batch_plan import find_items, make_plan
     from jaximp.job import read_job
@@ -280,8 +276,9 @@ def batch(
         return
     from jaximp.batch import run_plan
 
+    chosen = reports[0] if reports and len(reports) == 1 else reports or "none"
     with _interruptible(), _events(len(plan.items), quiet, json_lines) as tell:
-        outcome = run_plan(job, plan, out, workers, scheduler, resume, reports.value, tell)
+        outcome = run_plan(job, plan, out, workers, scheduler, resume, chosen, tell)
     if not json_lines:
         for failed in outcome.failed:
             console.print(f"failed: {failed['recording']}: {failed['reason']}", markup=False, soft_wrap=True)
@@ -290,7 +287,7 @@ def batch(
     if not (quiet or json_lines):
         done = outcome.recordings - len(outcome.failed)
         typer.echo(f"{done} of {outcome.recordings} recordings, {outcome.trusted} of {outcome.windows} windows trusted")
-        typer.echo(f"results: {out.resolve()}")
+        typer.echo(f"results: {out.resolve()}\noverview: {out.resolve() / 'overview.html'}")
     if outcome.exit_status:
         raise typer.Exit(outcome.exit_status)
 

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from browser import browser, executable
 
 from jaximp import batch, batch_plan, batch_results, stacks, windows
 from jaximp.batch_plan import find_items, make_plan, padded_sizes
@@ -506,6 +507,60 @@ def test_reports_are_those_that_were_asked_for(
     save_recording(recording_from_arrays(good.time, good.position, torque), tmp_path / "noise.parquet")
     assert batch.run(parse_job(JOB), [tmp_path], tmp_path / "out", reports=reports).exit_status == 0
     assert sorted(written) == expected
+
+
+def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a recording by its name, though its batch is done; the overview links it. A changed recording loses it."""
+
+    def write(job: Job, one: Recording, alone: Recording | None, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        (folder / "report.html").write_text(one.name)
+
+    monkeypatch.setattr(batch_results, "write_report_of", write)
+    for name in ("a", "b"):
+        save_recording(joint(1000), tmp_path / f"{name}.parquet")
+    job, out = parse_job(JOB), tmp_path / "out"
+    files = [tmp_path / "a.parquet", tmp_path / "b.parquet"]
+    batch.run(job, files, out)
+    assert "reports/" not in (out / "overview.html").read_text()
+    assert batch.run(job, files, out, resume=True, reports=["b.parquet"]).skipped == 2
+    assert [path.read_text() for path in out.glob("reports/*/report.html")] == ["b"]
+    assert "./reports/b.parquet/report.html" in (out / "overview.html").read_text()
+    with pytest.raises(ValueError, match="there is no recording 'c'"):
+        batch.run(job, files, out, resume=True, reports=["c"])
+    save_recording(joint(1000, 5), tmp_path / "b.parquet")
+    batch.run(job, files, out, resume=True)
+    assert not list(out.glob("reports/*"))
+    assert "reports/" not in (out / "overview.html").read_text()
+
+
+def test_a_report_that_fails_costs_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object) -> None:
+        raise RuntimeError("no figure")
+
+    monkeypatch.setattr(batch_results, "write_report_of", fail)
+    save_recording(joint(1000), tmp_path / "a.parquet")
+    events: list[dict[str, object]] = []
+    outcome = batch.run(parse_job(JOB), [tmp_path / "a.parquet"], tmp_path / "out", reports="all", tell=events.append)
+    assert outcome.exit_status == 0
+    assert {"event": "no report", "recording": "a.parquet", "reason": "RuntimeError: no figure"} in events
+
+
+def test_the_overview_of_a_study_opens_in_a_browser(study: Path) -> None:
+    """All recordings with their series; what a manifest says is text."""
+    page = study / "reference/overview.html"
+    assert "<script>alert" not in page.read_text()
+    if executable() is None:
+        pytest.skip("there is no chromium on this machine")
+    with browser() as one:
+        one.open(page.as_uri())
+        one.wait("document.documentElement.dataset.usable")
+        cells = one.evaluate("[...document.querySelectorAll('#table tbody :is(th, td)')].map(one => one.textContent)")
+        assert {f"r{k}.parquet" for k in range(8)} | {"<script>alert(1)</script>", "../x"} <= set(cells)
+        one.evaluate("document.getElementById('panels').scrollIntoView()")
+        one.frame()
+        one.wait("document.querySelectorAll('#panels svg path').length >= 4")
+        assert one.complaints() == []
 
 
 # --- what a manifest may not do ---------------------------------------------------------------------------------------
