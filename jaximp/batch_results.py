@@ -42,6 +42,11 @@ UNFINISHED = ".unfinished"
 """End of a temporary name."""
 RUN_COLUMNS = ("seconds",)
 """Columns of the recordings' table that differ from run to run."""
+WINDOW_COLUMNS = (
+    "recording", "start_s", "end_s", "equilibrium", "condition_number", "sigma_min", "residual_rms", "vaf",
+    "held_out_vaf", "dof", "samples", "verdict", "reason", "reflex_gain", "reflex_gain_stderr", "reflex_delay",
+)  # fmt: skip
+"""Columns of the windows beside the parameters."""
 OK, FAILED = "ok", "failed"
 ANY_RATE = 1000.0
 """Of recordings that could not be read [Hz]: a model's names do not depend on it."""
@@ -302,12 +307,16 @@ def _write_tables(task: Task, batch: Batch, results: Sequence[Result]) -> dict[s
 
 
 def windows_table(job: Job, results: Sequence[Result], k: int = 0) -> pa.Table:
-    """One row per window of all recordings: the columns of `estimates.parquet`, behind the recording's name."""
+    """One row per window of all recordings: the columns of `estimates.parquet`, behind the recording's name.
+
+    `condition` is called `condition_number` here: a study has conditions of its own, which partition its results.
+    """
     several = [result.estimates[k] for result in results]
     recording = results[0].recording
     assert recording is not None
     human = job.models(recording.joints, recording.sample_rate)[1]
     table = estimates_table(_one_after_another(several), human, job)
+    table = table.rename_columns({"condition": "condition_number"})
     names = pa.array(np.repeat([result.item.name for result in results], [len(one.start) for one in several]))
     return table.add_column(0, pa.field("recording", pa.string(), metadata={"unit": ""}), names.cast(pa.string()))
 
@@ -398,9 +407,11 @@ def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.flo
 
 
 def reserved_columns(job: Job) -> set[str]:
-    """Names that a manifest's columns cannot have, beside those of the parameters."""
-    table = recordings_table(Task(job, Path(), (), (), ()), [Result(Item("", Path()))])
-    return {*table.column_names, "recording", *("start_s", "end_s", "verdict", "vaf")}
+    """Names that a manifest's columns cannot have: those of the results."""
+    nothing = [Result(Item("", Path()))]
+    table, model = recordings_table(Task(job, Path(), (), (), ()), nothing), _model_of(job, nothing)
+    parameters = () if model is None else model.names
+    return {*table.column_names, *WINDOW_COLUMNS, *parameters, *(f"{name}_stderr" for name in parameters)}
 
 
 def _model_of(job: Job, results: Sequence[Result]) -> Model | None:

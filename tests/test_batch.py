@@ -285,6 +285,21 @@ def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
         np.testing.assert_allclose(pq.ParquetFile(path).read()["stiffness"], np.asarray(one.fit.theta)[:, 2], 1e-12)
 
 
+def test_a_study_has_conditions_of_its_own(tmp_path: Path) -> None:
+    """Beside the condition number; and no column of the windows can be shadowed by one of the manifest."""
+    import pyarrow.dataset as ds
+
+    save_recording(joint(1000), tmp_path / "a.parquet")
+    (tmp_path / "study.csv").write_text("file,condition\na.parquet,tense\n")
+    job = parse_job(JOB, tmp_path)
+    batch.run(job, out=tmp_path / "out", manifest=tmp_path / "study.csv")
+    table = ds.dataset(tmp_path / "out/estimates", format="parquet", partitioning="hive").to_table()
+    assert set(table["condition"].to_pylist()) == {"tense"}
+    expected = identify_recording(job, joint(1000))[0]
+    np.testing.assert_allclose(table["condition_number"], expected.fit.cond, 1e-6)
+    assert {*table.column_names} - {"condition"} <= batch_results.reserved_columns(job)
+
+
 @pytest.mark.parametrize("n_joints", [1, 2])
 def test_a_reflex_is_what_it_is_alone(tmp_path: Path, n_joints: int) -> None:
     """Recordings of two rates in one table, with gain and delay of every window and the gain in the row of each."""
@@ -595,6 +610,7 @@ def test_a_recording_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatc
         ("file\na.csv\na.csv\n", "more than once"),
         ("file,subject\na.csv\n", "more or fewer fields"),
         ("file,verdict\na.csv,x\n", "name of a result"),
+        ("file,stiffness_stderr\na.csv,x\n", "name of a result"),
         ("file,stiffness_mean\na.csv,x\n", "name of a result"),
         ("file,subject\na.csv," + 200 * "x" + "\n", "too long"),
     ],
