@@ -10,6 +10,7 @@ then one recording after another is solved, whose numbers stay in the cache.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 from numpy.typing import NDArray
 
@@ -226,7 +228,18 @@ def _stacked(job: Job, several: Sequence[Measured], layout: Layout) -> _Stack:
 
 @partial(compiled, static_argnums=(0, 1))
 def _program(layout: Layout, model: Model, stack: _Stack) -> _Found:
-    """Everything of a stack that is not judged."""
+    """Everything of a stack that is not judged; the recordings are shared out to the devices of this host."""
+    count = math.gcd(layout.stacked, jax.local_device_count())
+    if count == 1:
+        return _on_device(layout, model, stack)
+    mesh, share = Mesh(np.array(jax.local_devices()[:count]), ("recordings",)), PartitionSpec("recordings")
+    solve = partial(_on_device, layout, model)
+    found: _Found = jax.shard_map(solve, mesh=mesh, in_specs=share, out_specs=share, check_vma=False)(stack)
+    return found
+
+
+def _on_device(layout: Layout, model: Model, stack: _Stack) -> _Found:
+    """Of the share of one device."""
     W, y, moving, noise = jax.vmap(partial(_filtered, layout, model))(stack)
     valid = stack.clean[:, :: layout.decimate]
     valid = valid[..., None] & moving if moving.ndim == 3 else valid & moving

@@ -181,6 +181,32 @@ def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
         np.testing.assert_array_equal(one.solved[0].fit.stderr, other.solved[0].fit.stderr)
 
 
+def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
+    """Two devices, which XLA makes of one processor, give what one gives, and each has half of the recordings."""
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', True); from jaximp import batch, job, stacks; import sys\n"
+        "program, placed = stacks._program, []\n"
+        "def seen(*args):\n"
+        "    found = program(*args); placed.append(found.y.sharding.device_set); return found\n"
+        "stacks._program = seen\n"
+        "batch.run(job.read_job(sys.argv[1] + '/job.toml'), out=sys.argv[2], manifest=sys.argv[1] + '/study.csv')\n"
+        "print(sorted(map(len, placed)))"
+    )
+    flags = "--xla_force_host_platform_device_count=2"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(study), str(tmp_path / "out")],
+        env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)[-1] == 2
+    for path in (study / "reference/estimates").rglob("*.parquet"):
+        expected = pq.ParquetFile(path).read()
+        found = pq.ParquetFile(tmp_path / "out" / path.relative_to(study / "reference")).read()
+        assert found["verdict"] == expected["verdict"]
+        for name in ("stiffness", "stiffness_stderr", "condition_number", "held_out_vaf"):
+            np.testing.assert_allclose(found[name], expected[name], 1e-9, err_msg=name)
+
+
 def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
     """A thousand lengths are planned; of these a few dozen are run, at least one for each size."""
     compiled: list[str] = []
