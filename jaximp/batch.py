@@ -52,6 +52,8 @@ Tell = Callable[[dict[str, Any]], None]
 FOLDERS = ("estimates", "recordings", "receipts", "reports")
 IN_FLIGHT = 2
 """Batches that are handed out per worker: one is solved while the next one waits."""
+PATIENCE = 30.0
+"""How long a scheduler has to answer [s]."""
 PAGE = "overview.html"
 HIDDEN = (
     "samples", "sample_rate_hz", "threshold", "notes", "model", "filters", "versions", "sha256", "job_sha256",
@@ -121,6 +123,8 @@ def run_plan(
 ) -> Outcome:
     """As `run`, for a plan that is made."""
     require_float64()
+    if workers and scheduler is not None:
+        raise ValueError("give either workers of this machine or the address of a scheduler, one of the two")
     out = Path(os.path.abspath(out))
     check_metadata(job, plan)
     chosen = _checked_reports(reports, plan)
@@ -320,7 +324,7 @@ def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: s
             dashboard_address=None, worker_dashboard_address=None, silence_logs=50, env=_environment(),
         )  # fmt: skip
     try:
-        with Client(cluster if cluster is not None else scheduler, timeout=30) as client:
+        with _connected(Client, cluster if cluster is not None else scheduler) as client:
             if cluster is not None:
                 for number, address in enumerate(sorted(client.scheduler_info(n_workers=-1)["workers"])):
                     client.run(_settle, number, workers, workers=[address])
@@ -337,6 +341,15 @@ def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: s
     finally:
         if cluster is not None:
             cluster.close()
+
+
+def _connected(client: Any, cluster: Any) -> Any:
+    try:
+        return client(cluster, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        if not isinstance(cluster, str):
+            raise
+        raise ValueError(f"no Dask scheduler answers at {cluster}: check the address ({error})") from None
 
 
 def _environment() -> dict[str, str]:

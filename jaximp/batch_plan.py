@@ -252,6 +252,8 @@ def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None 
     """
     if job.trials is not None:
         raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
+    if job.robot_recording is None and any(item.robot_file is not None for item in items):
+        raise ValueError("the manifest has a robot_file, but the job no [robot_recording] to read it by: add the table")
     metadata = tuple(dict.fromkeys(key for item in items for key, _ in item.metadata))
     chosen = tuple(partitions) if partitions is not None else tuple(name for name in PARTITIONS if name in metadata)
     _check_partitions(chosen, metadata, items)

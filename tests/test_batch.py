@@ -635,6 +635,7 @@ def test_a_recording_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatc
         ("subject\nS1\n", "column 'file'"),
         ("file\na.csv\na.csv\n", "more than once"),
         ("file,subject\na.csv\n", "more or fewer fields"),
+        ("file,robot_file\na.csv,b.csv\n", "no \\[robot_recording\\]"),
         ("file,verdict\na.csv,x\n", "name of a result"),
         ("file,stiffness_stderr\na.csv,x\n", "name of a result"),
         ("file,stiffness_mean\na.csv,x\n", "name of a result"),
@@ -688,6 +689,18 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: 
     assert killed
     assert content(tmp_path / "out") == content(study / "reference")
     assert json.loads((tmp_path / "out/quarantine.json").read_text()) == []
+
+
+def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="one of the two"):
+        run(study, tmp_path / "a", workers=2, scheduler="tcp://127.0.0.1:1")
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(batch, "PATIENCE", 1.0)
+    with pytest.raises(ValueError, match="no Dask scheduler answers at tcp://127"):
+        run(study, tmp_path / "b", scheduler="tcp://127.0.0.1:1")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ValueError, match="jaximp\\[batch\\]"):
+        run(study, tmp_path / "c", workers=1)
 
 
 def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
