@@ -21,6 +21,8 @@ from jaximp.types import AnyArray
 
 Sections = NDArray[np.float64] | tuple[tuple[float, ...], ...]
 """Second-order sections (k, 6): an array, or plain numbers by which compiled code can be found again."""
+BLOCK = 64
+"""Samples that a filter takes in one product."""
 
 
 def require_float64(*arrays: object) -> None:
@@ -146,21 +148,55 @@ def _filter_from_rest(sos: NDArray[np.float64], x: Array, backward: bool = False
 
 @partial(jax.jit, static_argnames="backward")
 def _filter(sos: Array, rest: Array, x: Array, backward: bool) -> Array:
-    """Cascade in transposed direct form II; `rest` (k, 2) is the state of a unit input that lasts for ever.
+    """One pass over axis 0; `rest` (k, 2) is the state of a unit input that lasts for ever.
+
+    A cascade of recursions is linear in its input and in its state. So `BLOCK` samples are a product with one matrix,
+    and only the states from block to block are a recursion: short enough to cost next to nothing.
 
     The coefficients are arguments, so that filters with the same number of sections share their compiled code.
     """
+    n, signals = len(x), (x[::-1] if backward else x).reshape(len(x), -1).T
+    size = min(BLOCK, n)
+    blocks = jnp.pad(signals, ((0, 0), (0, -n % size))).reshape(len(signals), -1, size)
+    of_impulse, of_states, states, after = _responses(sos, size)
+    lag = jnp.arange(size) - jnp.arange(size)[:, None]
+    within = jnp.where(lag >= 0, of_impulse[lag], 0)  # (from, to) inside a block
+    entering = _product(blocks, states[::-1])
 
-    def step(state: list[tuple[Array, Array]], value: Array) -> tuple[list[tuple[Array, Array]], Array]:
-        new_state = []
-        for (b0, b1, b2, _, a1, a2), (z1, z2) in zip(sos, state, strict=True):
+    def to_next(state: Array, added: Array) -> tuple[Array, Array]:
+        return _product(state, after) + added, state
+
+    first = signals[:, :1] * rest.reshape(-1)
+    before = lax.scan(to_next, first, jnp.moveaxis(entering, 1, 0))[1]
+    y = _product(blocks, within) + _product(jnp.moveaxis(before, 0, 1), of_states)
+    y = y.reshape(len(signals), -1)[:, :n].T.reshape(x.shape)
+    return y[::-1] if backward else y
+
+
+def _responses(sos: Array, size: int) -> tuple[Array, Array, Array, Array]:
+    """What an impulse at the first of `size` samples, and each of the m states before it, lead to.
+
+    In transposed direct form II. Output of the impulse (size,) and of the states (m, size); the states that follow
+    every sample of the impulse (size, m), and those that each state leads to after the last sample (m, m).
+    """
+    m = 2 * len(sos)
+
+    def step(state: Array, value: Array) -> tuple[Array, tuple[Array, Array]]:
+        following = []
+        for (b0, b1, b2, _, a1, a2), (z1, z2) in zip(sos, state.reshape(len(sos), 2, -1), strict=True):
             out = b0 * value + z1
-            new_state.append((b1 * value - a1 * out + z2, b2 * value - a2 * out))
+            following += [b1 * value - a1 * out + z2, b2 * value - a2 * out]
             value = out
-        return new_state, value
+        state = jnp.stack(following)
+        return state, (value, state[:, 0])
 
-    first = x[-1] if backward else x[0]
-    return jax.lax.scan(step, [(z1 * first, z2 * first) for z1, z2 in rest], x, reverse=backward)[1]
+    begin = jnp.eye(m, m + 1, 1, dtype=sos.dtype)
+    impulse = jnp.zeros((size, m + 1), sos.dtype).at[0, 0].set(1)
+    last, (outputs, states) = lax.scan(step, begin, impulse)
+    return outputs[:, 0], outputs[:, 1:].T, states, last[:, 1:].T
+
+
+_product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
 class CutSignal(NamedTuple):
