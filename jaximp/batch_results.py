@@ -90,6 +90,8 @@ class Result:
     estimates: list[Estimates] = field(default_factory=list)
     """One for each method; none where it failed."""
     recording: Recording | None = None
+    stacked: tuple[Any, Measured] | None = None
+    """The program that solves it, and what goes into that; nothing where it is identified by itself."""
     reason: str = ""
     seconds: float = 0.0
     sha256: str = ""
@@ -131,10 +133,10 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
     recording raises nothing: the receipt says it.
     """
     begin = time.perf_counter()
-    results = [_read(task, item) for item in batch.items]
+    results = [_read(task, batch, item) for item in batch.items]
     if stopped():
         raise Interrupted
-    _solve(task, batch, results)
+    _solve(task, results)
     if stopped():
         raise Interrupted
     unwritten = _write_reports(task, results)
@@ -197,12 +199,17 @@ def write_whole(path: Path, content: bytes) -> None:
 # --- reading and solving ----------------------------------------------------------------------------------------------
 
 
-def _read(task: Task, item: Item) -> Result:
+def _read(task: Task, batch: Batch, item: Item) -> Result:
+    """A recording, and what is measured of it while its numbers are at hand."""
     begin = time.perf_counter()
     result = Result(item, sha256=_input_checksum(item), reason=item.refused)
     if not result.reason:
         with _reasons(result):
-            result.recording = _load(task.job.recording, item.file, task.job.folder)
+            result.recording = recording = _load(task.job.recording, item.file, task.job.folder)
+            size = next((size for size in task.sizes if size[0] >= len(recording)), None)
+            if batch.padded and size is not None:
+                found = measure(task.job, recording)
+                result.stacked = (found.layout(task.job, *size), found.model), found
     result.seconds = time.perf_counter() - begin
     return result
 
@@ -236,22 +243,17 @@ class _reasons:
         return True
 
 
-def _solve(task: Task, batch: Batch, results: Sequence[Result]) -> None:
+def _solve(task: Task, results: Sequence[Result]) -> None:
     """Estimates of every recording that could be read, or the reason why there are none."""
     job, stacks = task.job, dict[Any, list[tuple[Result, Measured]]]()
     for result in results:
         begin = time.perf_counter()
-        if result.recording is not None:
-            with _reasons(result):
-                size = next((size for size in task.sizes if size[0] >= len(result.recording)), None)
-                if batch.padded and size is not None:
-                    found = measure(job, result.recording)
-                    program = found.layout(job, *size), found.model
-                    stacks.setdefault(program, []).append((result, found))
-                else:
-                    with _one_at_a_time:
-                        alone = _alone(task, result.item)
-                        result.estimates = identify_recording(job, result.recording, alone)
+        if result.stacked is not None:
+            program, found = result.stacked
+            stacks.setdefault(program, []).append((result, found))
+        elif result.recording is not None and not result.reason:
+            with _reasons(result), _one_at_a_time:
+                result.estimates = identify_recording(job, result.recording, _alone(task, result.item))
         result.seconds += time.perf_counter() - begin
     for (layout, _), members in stacks.items():
         begin = time.perf_counter()

@@ -168,12 +168,38 @@ class _Pair:
     loaded: Regression
 
 
+class Moments(NamedTuple):
+    """Of all rows that count, whatever the window."""
+
+    torque: AnyArray
+    """() variance [N^2 m^2]."""
+    columns: AnyArray
+    """(p,) mean squares."""
+
+    @property
+    def parameter_scale(self) -> NDArray[np.float64]:
+        """(p,) what each parameter would be if its column made all of the torque's variation by itself."""
+        size = np.sqrt(self.columns)
+        return np.sqrt(self.torque) / np.where(size > 0, size, np.inf)
+
+
+def moments(W: AnyArray, torque: AnyArray, valid: AnyArray) -> Moments:
+    """Of (N, *n, p) columns and (N, *n) torques, where they are valid; of JAX's arrays or numpy's."""
+    xp = jnp if isinstance(W, Array) else np
+    W, torque, valid = W.reshape(-1, W.shape[-1]), torque.ravel(), valid.ravel()
+    count = xp.maximum(valid.sum(), 1)
+    mean = xp.where(valid, torque, 0).sum() / count
+    variance = (xp.where(valid, torque - mean, 0) ** 2).sum() / count
+    return Moments(variance, (xp.where(valid[:, None], W, 0) ** 2).sum(axis=0) / count)
+
+
 class Solved(NamedTuple):
     """What is found in the windows before it is judged."""
 
     fit: SlidingFit
     unseen: Score
     """How well each window's parameters predict the torque of the window behind it."""
+    moments: Moments
 
 
 @dataclass(frozen=True)
@@ -447,7 +473,8 @@ def _predict(rows: Rows, fit: SlidingFit, place: Placement) -> Solved:
     """Hold every window's parameters against the window behind it."""
     ahead = place.next_starts[: len(fit.last)]
     valid = jnp.asarray(rows.valid)
-    return Solved(fit, score(rows.W, rows.torque, valid, fit.theta, ahead, place.window, place.step, place.room))
+    unseen = score(rows.W, rows.torque, valid, fit.theta, ahead, place.window, place.step, place.room)
+    return Solved(fit, unseen, moments(*(np.asarray(x) for x in (rows.W, rows.torque, rows.valid))))
 
 
 def _estimates(
@@ -463,10 +490,9 @@ def _estimates(
 ) -> Estimates:
     """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
     recording, model = prepared.recording, prepared.model
-    fit, unseen = solved
+    fit, unseen, whole = solved
     starts = place.starts[: len(fit.last)]
-    usual = np.asarray(rows.torque)[np.asarray(rows.valid)].var()
-    held_out = np.where(np.asarray(unseen.variance) > STILL * usual, np.asarray(unseen.vaf), np.nan)
+    held_out = np.where(np.asarray(unseen.variance) > STILL * whole.torque, np.asarray(unseen.vaf), np.nan)
     if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
         valid = jnp.asarray(rows.valid)
         seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, place.room)
@@ -482,7 +508,7 @@ def _estimates(
         fit,
         model.names,
         place.counted * model.n_joints,
-        _parameter_scale(rows),
+        whole.parameter_scale,
         prepared.column_noise,
         threshold,
         limits,
@@ -589,14 +615,6 @@ def reference_motion(job: Job, recording: Recording) -> ReferenceMotion:
     if len(reference) < round(job.reference_period * rate) or not np.isfinite(reference).all():
         return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
     return reference, *signals.central_differences(reference, rate)
-
-
-def _parameter_scale(rows: Rows) -> NDArray[np.float64]:
-    """(p,) what each parameter would be if its column made all of the torque's variation by itself."""
-    counted = np.asarray(rows.valid)
-    W, torque = np.asarray(rows.W)[counted], np.asarray(rows.torque)[counted]
-    size = np.sqrt((W**2).mean(axis=0))
-    return torque.std() / np.where(size > 0, size, np.inf)
 
 
 def _reconstruct(

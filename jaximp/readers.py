@@ -172,7 +172,7 @@ def _read_parquet(path: Path, names: list[str]) -> dict[str, Any]:
     import pyarrow
     from pyarrow import parquet
 
-    with parquet.ParquetFile(path) as file:
+    with parquet.ParquetFile(path, pre_buffer=False) as file:
         schema = file.schema_arrow
         for name in names:
             _require(name, schema.names)

@@ -212,13 +212,18 @@ def recording_from_mapping(table: Mapping[str, Any], folder: str | os.PathLike[s
 def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
     """Refuse a mapping of columns with a key that `load_recording` (and `others`) do not know, or without those that it
     needs."""
-    known = [*others, *list(inspect.signature(load_recording).parameters)[1:]]
+    known = [*others, *_keywords()]
     for key in table:
         if key not in known:
             raise RecordingError(f"{where}: unknown key {key!r}; {nearest(str(key), known)}")
     for key in ("position", "torque"):
         if key not in table:
             raise RecordingError(f"{where}: '{key}' is missing; add it")
+
+
+@lru_cache(maxsize=1)
+def _keywords() -> tuple[str, ...]:
+    return tuple(inspect.signature(load_recording).parameters)[1:]
 
 
 def recording_from_arrays(
@@ -557,6 +562,8 @@ def _check_stamps(label: str, stamps: NDArray[np.float64]) -> None:
 
 def _complete_rows(labels: list[str], samples: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[str]]:
     """(N,) True where every channel was measured, and a note if that is not everywhere."""
+    if np.isfinite(samples).all():
+        return np.ones(len(samples), bool), []
     infinite = np.argwhere(np.isinf(samples))
     if len(infinite):
         row, i = infinite[0]
@@ -599,10 +606,13 @@ _Gridded = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], li
 
 def _on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], valid: NDArray[np.bool_]) -> _Gridded:
     """Time, samples and validity on the grid, and what was done: masked if rows are missing, resampled if uneven."""
+    if _is_even(stamps):
+        return stamps, samples, valid, []
     with np.errstate(all="ignore"):
         intervals = np.diff(stamps)
         # The lower median is an interval that occurs; the mean of two could fall between one and two steps.
-        median = np.quantile(intervals, 0.5, method="lower")
+        middle = (len(intervals) - 1) // 2
+        median = np.partition(intervals, middle)[middle]
         growth = (stamps[-1] - stamps[0]) / median / len(stamps)
     if not 1e-9 < median < 1e6:
         raise RecordingError(f"the median interval of {median:.3g} s is no sampling interval; correct the unit of time")
@@ -621,6 +631,13 @@ def _on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], 
         hint = "" if intervals[longest] > 2.5 * median else " (if stamps are only rounded, give 'sample_rate' instead)"
         notes.append(f"{what} ({where}): the samples inside are masked{hint}")
     return time, samples, valid, notes
+
+
+def _is_even(stamps: NDArray[np.float64]) -> bool:
+    """Whether nothing is to be done."""
+    step = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
+    late = stamps - (stamps[0] + step * np.arange(len(stamps)))
+    return bool(1e-9 < step < 1e6 and np.abs(late).max() <= 1e-7 * step)
 
 
 def _placed(
@@ -645,12 +662,12 @@ def _placed(
     time = start + step * np.arange(index[-1] + 1)
     if deviation <= max(1e-6 * step, 4 * np.spacing(np.abs(stamps).max())):
         time[index] = stamps
-    full = np.full((len(time), samples.shape[1]), np.nan)
-    full[index] = samples
-    measured = np.zeros(len(time), bool)
-    measured[index] = valid
+    if len(time) > len(stamps):
+        full, measured = np.full((len(time), samples.shape[1]), np.nan), np.zeros(len(time), bool)
+        full[index], measured[index] = samples, valid
+        samples, valid = full, measured
     rounded = f"the time stamps are rounded to {digit:g} s; taken as evenly spaced at {1 / step:.6g} Hz"
-    return time, full, measured, [rounded] if deviation > JITTER * step else []
+    return time, samples, valid, [rounded] if deviation > JITTER * step else []
 
 
 def _rounding(stamps: NDArray[np.float64]) -> float:

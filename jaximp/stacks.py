@@ -31,7 +31,7 @@ from jaximp import signals
 from jaximp.chunks import LONGEST_REACH, Task, finish
 from jaximp.compilation import compiled
 from jaximp.engine import BLOCK, ChunkFit, Plan, solve_chunk
-from jaximp.identify import Prepared, Solved, checked_models, reference_motion
+from jaximp.identify import Prepared, Solved, checked_models, moments, reference_motion
 from jaximp.job import Job
 from jaximp.least_squares import variance_accounted_for
 from jaximp.models import Joints, Model
@@ -160,7 +160,7 @@ class _Found(eqx.Module):
     moving: AnyArray
     column_noise: AnyArray
     solved: tuple[Any, ...]
-    """For each joint (of joints side by side) the fits and predictions of all windows."""
+    """For each joint (of joints side by side) the fits and predictions of all windows, and the moments of all rows."""
 
 
 def solve_stack(job: Job, several: Sequence[Measured], layout: Layout) -> list[Prepared | ValueError]:
@@ -247,11 +247,12 @@ def _on_device(layout: Layout, model: Model, stack: _Stack) -> _Found:
     def solve(one: tuple[Array, Array, Array, Array | None]) -> tuple[Any, ...]:
         W, y, valid, noise = one
         if not isinstance(model, Joints):
-            return (_solved(layout, W, y, valid, noise),)
+            return ((*_solved(layout, W, y, valid, noise), moments(W, y, valid)),)
         results, first = [], 0
         for j, part in enumerate(model.models):
             columns = slice(first, first + len(part.names))
-            results.append(_solved(layout, W[:, j, columns], y[:, j], valid[:, j], noise))
+            own = W[:, j, columns], y[:, j], valid[:, j]
+            results.append((*_solved(layout, *own, noise), moments(*own)))
             first = columns.stop
         return tuple(results)
 
@@ -356,7 +357,7 @@ def _of_joint(rows: Rows, j: int, columns: slice) -> Rows:
 def _finished(rows: Rows, noise: AnyArray | None, found: Any, layout: Layout) -> Solved:
     """What the program found in the windows of one recording; a doubtful window is decomposed."""
     starts = window_starts(len(rows.time), layout.window, layout.step)
-    fit, unseen = jax.tree.map(lambda x: x[: len(starts)], found)
+    fit, unseen = jax.tree.map(lambda x: x[: len(starts)], found[:2])
     doubtful = np.zeros(0, int)
     if isinstance(fit, ChunkFit):
         outputs = 1 if rows.torque.ndim == 1 else rows.torque.shape[1]
@@ -370,7 +371,7 @@ def _finished(rows: Rows, noise: AnyArray | None, found: Any, layout: Layout) ->
     vaf = np.where(complete & np.isfinite(fit.theta).all(axis=1), unseen.vaf, np.nan)
     for k in doubtful[np.isfinite(vaf[doubtful])]:
         vaf[k] = _predicted(rows, fit.theta[k], starts[k] + layout.window, layout.window)
-    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf))
+    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[2])
 
 
 def _predicted(rows: Rows, theta: NDArray[np.float64], start: int, window: int) -> float:

@@ -322,25 +322,27 @@ def judge(
     `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
     `column_noise` (p,) root mean square of each column that noise in the position alone gives.
     """
-    theta, stderr, excitation = (np.asarray(x) for x in (fit.theta, fit.stderr, fit.excitation))
+    # One row per parameter: what is worked out over the parameters then runs along the windows.
+    theta, stderr, excitation = (np.ascontiguousarray(np.asarray(x).T) for x in (fit.theta, fit.stderr, fit.excitation))
     samples, cond, vaf, residual = (np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf, fit.residual_rms))
     dof = np.asarray(fit.dof)
     with np.errstate(invalid="ignore", divide="ignore"):
-        error = stderr / np.maximum(np.abs(theta), parameter_scale)
-        built_by_noise = np.sqrt(samples)[:, None] * column_noise
+        error = stderr / np.maximum(np.abs(theta), parameter_scale[:, None])
+        built_by_noise = np.sqrt(samples) * column_noise[:, None]
         ratio = np.where(built_by_noise > 0, excitation / built_by_noise, np.inf)
-    judged = _judged(names, limits.parameters)
+        negative = -theta / stderr
+    judged = _judged(names, limits.parameters)[:, None]
     error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
-    noisiest, loosest = ratio.argmin(axis=1), error.argmax(axis=1)
-    ratio, error = ratio.min(axis=1), error.max(axis=1)
+    noisiest, loosest = ratio.argmin(axis=0), error.argmax(axis=0)
+    ratio, error = ratio.min(axis=0), error.max(axis=0)
     rules: list[Rule] = [
         (
-            (samples < limits.min_valid_share * window_samples) | (samples < theta.shape[1]),
+            (samples < limits.min_valid_share * window_samples) | (samples < len(names)),
             NO_DATA,
             lambda k: f"{samples[k]} of {window_samples} samples can be used",
         ),
         (
-            ~np.isfinite(theta).all(axis=1),
+            ~np.isfinite(theta).all(axis=0),
             WEAK,
             lambda k: "columns are zero or collinear: the parameters cannot be told apart",
         ),
@@ -388,7 +390,7 @@ def judge(
         )
     )
     mass = np.array([name.endswith(("inertia", "inertia_1", "inertia_3")) for name in names])
-    below_zero = np.where(mass, -theta / stderr, -np.inf).max(axis=1)
+    below_zero = np.where(mass[:, None], negative, -np.inf).max(axis=0)
     rules.append(
         (
             below_zero > limits.max_negative_inertia,
@@ -399,19 +401,21 @@ def judge(
         )
     )
     friction = np.array([name.rstrip("_12").endswith(("viscous_friction", "coulomb_friction")) for name in names])
-    drives = np.where(friction, -theta / stderr, -np.inf)
+    drives = np.where(friction[:, None], negative, -np.inf)
     rules.append(
         (
-            drives.max(axis=1) > limits.max_negative_inertia,
+            drives.max(axis=0) > limits.max_negative_inertia,
             POOR,
-            lambda k: f"{names[int(drives[k].argmax())]} is negative, by {drives[k].max():.2g} standard errors",
+            lambda k: f"{names[int(drives[:, k].argmax())]} is negative, by {drives[:, k].max():.2g} standard errors",
         )
     )
     rules += _matrix_rules(fit, names, limits)
     broken = np.stack([mask for mask, _, _ in rules])
     first = np.where(broken.any(axis=0), broken.argmax(axis=0), len(rules))
     verdict = np.array([name for _, name, _ in rules] + [TRUSTED])[first]
-    reason = ["" if rule == len(rules) else rules[rule][2](k) for k, rule in enumerate(first)]
+    reason = [""] * len(first)
+    for k in np.flatnonzero(first < len(rules)):
+        reason[k] = rules[first[k]][2](k)
     return Verdicts(verdict, np.array(reason))
 
 

@@ -160,7 +160,7 @@ def rate(times: list[tuple[float, int]]) -> float:
 def phases(folder: Path, job: Job, out: Path) -> dict[str, float]:
     """Where the time of a batch goes [ms per recording], on one thread."""
     plan = make_plan(job, find_items([str(folder / "r*.parquet")]))
-    task, spent = batch_results.Task.of(job, plan, out), {"read": 0.0, "solve": 0.0}
+    task, spent = batch_results.Task.of(job, plan, out), {"read": 0.0, "solve": 0.0, "measure": 0.0}
     originals = {"read": batch_results._read, "solve": batch_results.solve_stack, "measure": batch_results.measure}
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -174,12 +174,13 @@ def phases(folder: Path, job: Job, out: Path) -> dict[str, float]:
 
     batch_results._read = timed("read", originals["read"])
     batch_results.solve_stack = timed("solve", originals["solve"])
-    batch_results.measure = timed("solve", originals["measure"])
+    batch_results.measure = timed("measure", originals["measure"])
     chosen = [one for one in plan.batches if len(one.items) == one.stacked][:4]
     total = seconds(lambda: [batch_results.solve_batch(task, one) for one in chosen])
     batch_results._read, batch_results.solve_stack = originals["read"], originals["solve"]
     batch_results.measure = originals["measure"]
     count = sum(len(one.items) for one in chosen)
+    spent["read"], spent["solve"] = spent["read"] - spent["measure"], spent["solve"] + spent["measure"]
     found = {f"{name}_ms": 1e3 * spent[name] / count for name in ("read", "solve")}
     return found | {"overhead_ms": 1e3 * (total - spent["read"] - spent["solve"]) / count}
 
