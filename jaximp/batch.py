@@ -434,14 +434,16 @@ def _series(out: Path, parameter: str) -> dict[str, Series]:
     """One parameter of every recording over time, as much of it as a panel shows; file by file."""
     found: dict[str, Series] = {}
     for file in sorted((out / "estimates").rglob("batch-*.parquet")):
-        table = pq.ParquetFile(file).read(columns=["recording", "end_s", parameter, "verdict"])
-        names = table["recording"].to_numpy()
-        ends, values = (table[name].to_numpy() for name in ("end_s", parameter))
-        trusted = table["verdict"].to_numpy() == TRUSTED
-        ends_of = np.flatnonzero(np.r_[names[1:] != names[:-1], True]) + 1
+        columns = ["recording", "end_s", parameter, "verdict"]
+        table = pq.ParquetFile(file, read_dictionary=["recording", "verdict"]).read(columns=columns).combine_chunks()
+        names, ends, values, verdicts = (table[name].chunk(0) for name in columns)
+        trusted = np.array([text == TRUSTED for text in verdicts.dictionary.to_pylist()])[verdicts.indices]
+        which = names.indices.to_numpy()
+        ends_of = np.flatnonzero(np.r_[which[1:] != which[:-1], True]) + 1
         for begin, end in zip([0, *ends_of[:-1]], ends_of, strict=True):
             one = slice(begin, end)
-            found[str(names[begin])] = thinned(Series(ends[one], values[one], trusted[one]))
+            series = Series(ends.to_numpy()[one], values.to_numpy(zero_copy_only=False)[one], trusted[one])
+            found[str(names[int(begin)])] = thinned(series)
     return found
 
 

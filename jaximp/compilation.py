@@ -20,20 +20,17 @@ WANTED: dict[str, Any] = {
 
 @cache
 def options() -> dict[str, Any]:
-    """The settings that this version of XLA knows and needs; none of them changes a result.
+    """The settings, where this version of XLA knows and needs them; none of them changes a result.
 
     From jax 0.12 on it is as fast without them, and can break off where barriers are kept.
     """
-    known: dict[str, Any] = {}
     if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 11):
-        return known
-    for name, value in WANTED.items():
-        try:
-            jax.jit(lambda x: x, compiler_options={name: value}).lower(0).compile()
-        except Exception:  # whatever a version raises for a name that it does not know
-            continue
-        known[name] = value
-    return known
+        return {}
+    try:
+        jax.jit(lambda x: x, compiler_options=WANTED).lower(0).compile()
+    except Exception:  # whatever a version raises for a name that it does not know
+        return {}
+    return WANTED
 
 
 def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:

@@ -239,24 +239,22 @@ def _program(layout: Layout, model: Model, stack: _Stack) -> _Found:
 
 
 def _on_device(layout: Layout, model: Model, stack: _Stack) -> _Found:
-    """Of the share of one device."""
-    W, y, moving, noise = jax.vmap(partial(_filtered, layout, model))(stack)
-    valid = stack.clean[:, :: layout.decimate]
-    valid = valid[..., None] & moving if moving.ndim == 3 else valid & moving
+    """Of the share of one device: one after another, so that a recording's numbers stay at hand."""
 
-    def solve(one: tuple[Array, Array, Array, Array | None]) -> tuple[Any, ...]:
-        W, y, valid, noise = one
-        if not isinstance(model, Joints):
-            return ((*_solved(layout, W, y, valid, noise), moments(W, y, valid)),)
+    def solve(one: _Stack) -> _Found:
+        W, y, moving, column_noise = _filtered(layout, model, one)
+        valid = one.clean[:: layout.decimate]
+        valid = valid[:, None] & moving if moving.ndim == 2 else valid & moving
         results, first = [], 0
-        for j, part in enumerate(model.models):
+        for j, part in enumerate(model.models if isinstance(model, Joints) else (model,)):
             columns = slice(first, first + len(part.names))
-            own = W[:, j, columns], y[:, j], valid[:, j]
-            results.append((*_solved(layout, *own, noise), moments(*own)))
+            own = (W[:, j, columns], y[:, j], valid[:, j]) if isinstance(model, Joints) else (W, y, valid)
+            results.append((*_solved(layout, *own, one.noise), moments(*own)))
             first = columns.stop
-        return tuple(results)
+        return _Found(W, y, moving, column_noise, tuple(results))
 
-    return _Found(W, y, moving, noise, lax.map(solve, (W, y, valid, stack.noise)))
+    found: _Found = lax.map(solve, stack)
+    return found
 
 
 def _filtered(layout: Layout, model: Model, one: _Stack) -> tuple[Array, Array, Array, Array]:
@@ -341,7 +339,7 @@ def _prepared(one: Measured, found: _Found, layout: Layout) -> Prepared:
         model=model,
         filters=filters,
         rows=rows,
-        noise=None if noise is None else jnp.asarray(noise),
+        noise=None,  # the windows are solved
         column_noise=without_jumps(model, found.column_noise),
         pair=None,
         reference=one.reference,
