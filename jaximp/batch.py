@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import threading
 import time
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximp.batch_plan import Batch, Item, Plan, find_items, make_plan
+from jaximp.batch_plan import LOG, Batch, Item, Plan, find_items, make_plan
 from jaximp.batch_results import (
     RUN_COLUMNS,
     UNFINISHED,
@@ -49,7 +51,9 @@ from jaximp.trust import TRUSTED
 Tell = Callable[[dict[str, Any]], None]
 """Called with what happens: `{"event": "batch", "done": 64, ...}`."""
 
-FOLDERS = ("estimates", "recordings", "receipts", "reports")
+FOLDERS = r"estimates(_method\d)?|recordings|receipts"
+FILES = rf"batch-\d+\.(parquet|json)|\..*{UNFINISHED}"
+"""What a batch writes, and where; all else in a folder of results is somebody's own."""
 IN_FLIGHT = 2
 """Batches that are handed out per worker: one is solved while the next one waits."""
 PATIENCE = 30.0
@@ -227,16 +231,18 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
         _take_up(outcome, receipt)
         outcome.skipped += len(batch.items)
     for folder in task.out.iterdir():
-        if folder.is_symlink() or not folder.is_dir() or not folder.name.startswith(FOLDERS[:3]):
+        if folder.is_symlink() or not folder.is_dir() or not re.fullmatch(FOLDERS, folder.name):
             continue
         for where, _, names in os.walk(folder, topdown=False):
             for path in (Path(where) / name for name in names):
-                if path not in kept:
+                if path not in kept and re.fullmatch(FILES, path.name):
                     path.unlink()
             with suppress(OSError):
                 Path(where).rmdir()  # unless it still holds something
     for path in task.out.glob(f".*{UNFINISHED}"):
         path.unlink()
+    for draft in (task.out / "reports").glob(".*"):
+        shutil.rmtree(draft, ignore_errors=True)
     log({"event": "resume", "skipped": outcome.skipped, "left": sum(len(batch.items) for batch in left)})
     return left
 
@@ -244,15 +250,19 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
 @contextmanager
 def _log(out: Path, tell: Tell) -> Iterator[Tell]:
     """What happens goes to batch.log as well, a line of JSON each. A full disk must not end a run by its log."""
-    with (out / "batch.log").open("a", encoding="utf-8") as file:
+    file = (out / LOG).open("a", encoding="utf-8")
 
-        def log(event: dict[str, Any]) -> None:
-            with suppress(OSError):
-                file.write(json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **event}) + "\n")
-                file.flush()
-            tell(event)
+    def log(event: dict[str, Any]) -> None:
+        with suppress(OSError):
+            file.write(json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **event}) + "\n")
+            file.flush()
+        tell(event)
 
+    try:
         yield log
+    finally:
+        with suppress(OSError):
+            file.close()
 
 
 # --- who solves -------------------------------------------------------------------------------------------------------
@@ -325,12 +335,9 @@ def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: s
         )  # fmt: skip
     try:
         with _connected(Client, cluster if cluster is not None else scheduler) as client:
-            if cluster is not None:
-                for number, address in enumerate(sorted(client.scheduler_info(n_workers=-1)["workers"])):
-                    client.run(_settle, number, workers, workers=[address])
 
             def submit(batch: Batch) -> Any:
-                return client.submit(_work, task, batch, pure=False)
+                return client.submit(_work, task, batch, workers, pure=False)
 
             def first_done(futures: list[Any]) -> list[Any]:
                 done = wait_for(futures, return_when="FIRST_COMPLETED").done
@@ -363,8 +370,12 @@ def _environment() -> dict[str, str]:
     return settings
 
 
-def _settle(number: int, workers: int) -> None:
-    """Give a local worker cores, and an accelerator, of its own; before its first computation."""
+@cache
+def _settle(workers: int) -> None:
+    """Give one of so many local workers cores, and an accelerator, of its own; before its first computation."""
+    from distributed import get_worker
+
+    number = int(get_worker().name)
     if hasattr(os, "sched_setaffinity"):
         mine = sorted(os.sched_getaffinity(0))
         share = max(1, len(mine) // workers)
@@ -375,8 +386,10 @@ def _settle(number: int, workers: int) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = str(number % accelerators)
 
 
-def _work(task: Task, batch: Batch) -> dict[str, Any]:
-    """A batch on a worker, whatever its settings."""
+def _work(task: Task, batch: Batch, workers: int) -> dict[str, Any]:
+    """A batch on one of so many workers of this machine (or none: on somebody's cluster), whatever its settings."""
+    if workers:
+        _settle(workers)
     import jax
 
     with jax.enable_x64(True):
@@ -405,7 +418,10 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
     """
     out = Path(out)
     table = read_recordings(out)
-    table = table.select([name for name in table.column_names if name not in HIDDEN and not _is_detail(name)])
+    found = [name for name in table.column_names if name not in metadata]
+    parameters = [name.removesuffix("_mean") for name in found if name.endswith("_mean")]
+    details = {f"{name}{end}" for name in parameters for end in ("_median_stderr", "_half_width_95")}
+    table = table.select([name for name in table.column_names if name not in {*HIDDEN, *details}])
     for name in metadata:
         place, texts = table.column_names.index(name), table[name].to_pylist()
         table = table.set_column(
@@ -414,7 +430,6 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
     groups = [name for name in groups if name != "subject"]
     if groups and len(set(zip(*(table[name].to_pylist() for name in groups), strict=True))) > MOST_GROUPS:
         groups = []
-    parameters = [name.removesuffix("_mean") for name in table.column_names if name.endswith("_mean")]
     reports = {name: report_folder(out, name) / "report.html" for name in table["recording"].to_pylist()}
     links = {name: file.relative_to(out).as_posix() for name, file in reports.items() if file.is_file()}
     series = _series(out, main_parameter(parameters)) if parameters else {}
@@ -424,10 +439,6 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
         os.replace(unfinished, out / PAGE)
     finally:
         unfinished.unlink(missing_ok=True)
-
-
-def _is_detail(name: str) -> bool:
-    return name.endswith(("_median_stderr", "_half_width_95"))
 
 
 def _series(out: Path, parameter: str) -> dict[str, Series]:

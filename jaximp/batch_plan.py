@@ -24,6 +24,7 @@ from urllib.parse import quote
 import numpy as np
 
 from jaximp.job import Job
+from jaximp.outputs import MARK
 from jaximp.readers import FORMATS, RecordingError, count_samples
 from jaximp.stacks import stack_size, stackable
 
@@ -39,6 +40,7 @@ PARTITIONS = ("subject", "session", "condition")
 """Columns of a manifest that partition the results, where nothing else is said."""
 MISSING = "missing"
 """An empty value in a folder's name: the name that Hive has for it not every reader can digest."""
+LOG = "batch.log"
 LONGEST_NAME = 120
 """Letters of a value in a folder's name, after encoding."""
 
@@ -147,7 +149,9 @@ def find_items(files: Sequence[str], manifest: Path | None = None, allow_outside
     if (manifest is None) == (not files):
         raise ValueError("give either recordings or --manifest FILE, one of the two")
     items = _from_manifest(manifest, allow_outside) if manifest is not None else _from_paths(files)
-    doubled = [name for name, count in Counter(item.name for item in items).items() if count > 1]
+    listed = Counter(str(item.file) for item in items)
+    doubled = [item.name for item in items if listed[str(item.file)] > 1]
+    doubled += [name for name, count in Counter(item.name for item in items).items() if count > 1]
     if doubled:
         raise ValueError(f"{doubled[0]} is listed more than once: every recording is to be identified once")
     return sorted(items, key=lambda item: item.name)
@@ -156,7 +160,9 @@ def find_items(files: Sequence[str], manifest: Path | None = None, allow_outside
 def _from_paths(files: Sequence[str]) -> list[Item]:
     found: dict[str, Path] = {}
     for given in files:
-        matches = [given] if os.path.lexists(given) else sorted(glob.glob(given, recursive=True))
+        matches = [given]
+        if not os.path.lexists(given):
+            matches = [path for path in sorted(glob.glob(given, recursive=True)) if not _in_results(Path(path))]
         if not matches:
             raise ValueError(f"{given}: there is no such file; check the path")
         for match in matches:
@@ -165,14 +171,29 @@ def _from_paths(files: Sequence[str]) -> list[Item]:
                 raise ValueError(f"{match}: no recording in this folder; known are {', '.join(FORMATS)}")
             found |= {os.path.abspath(path): path for path in inside}
     common = os.path.commonpath([os.path.dirname(path) for path in found])
-    return [Item(Path(path).relative_to(common).as_posix(), Path(path)) for path in found]
+    return [Item(printable(Path(path).relative_to(common).as_posix()), Path(path)) for path in found]
+
+
+def printable(text: str) -> str:
+    """A file's name may be no text at all; then the bytes that are none are written out."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _recordings_in(folder: Path) -> list[Path]:
-    """Files of a known format, at any depth; what is hidden is left out."""
-    paths = [Path(where) / name for where, folders, names in os.walk(folder) for name in names]
+    """Files of a known format, at any depth; what is hidden, and what a batch wrote, is left out."""
+
+    def unreadable(error: OSError) -> None:
+        raise ValueError(f"{error.filename}: {error.strerror}; give its recordings by name, or leave it out")
+
+    paths = [Path(where) / name for where, _, names in os.walk(folder, onerror=unreadable) for name in names]
+    paths = [path for path in paths if not _in_results(path, folder)]
     shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
     return sorted(path for path in shown if path.suffix.lower() in FORMATS)
+
+
+def _in_results(path: Path, below: Path = Path()) -> bool:
+    """Whether a batch wrote this file."""
+    return any((folder / LOG).is_file() and (folder / MARK).is_file() for folder in path.parents if folder != below)
 
 
 def _from_manifest(manifest: Path, allow_outside: bool) -> list[Item]:
@@ -208,7 +229,12 @@ def _manifest_rows(manifest: Path) -> list[dict[str, str]]:
     elif manifest.suffix.lower() == ".csv":
         try:
             with manifest.open(encoding="utf-8-sig", newline="") as text:
-                rows = list(csv.DictReader(text, strict=True))
+                lines = csv.DictReader(text, strict=True)
+                header = [name.strip() for name in lines.fieldnames or ()]
+                if len(set(header)) < len(header):
+                    raise csv.Error("two columns have the same name")
+                lines.fieldnames = header
+                rows = list(lines)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{manifest}: this is not a CSV file in UTF-8: {error}") from None
     else:
@@ -217,7 +243,8 @@ def _manifest_rows(manifest: Path) -> list[dict[str, str]]:
         raise ValueError(f"{manifest}: a manifest has a column 'file' and a row for every recording; add them")
     if any(None in row or None in row.values() for row in rows) and manifest.suffix.lower() == ".csv":
         raise ValueError(f"{manifest}: a row has more or fewer fields than the header; repair it")
-    return [{str(key): "" if value is None else str(value) for key, value in row.items()} for row in rows]
+    # NaN is what pandas writes where there is nothing.
+    return [{key: "" if value is None or value != value else str(value) for key, value in row.items()} for row in rows]
 
 
 def _inside(folder: Path, name: str, where: str, allow_outside: bool) -> Path:
@@ -235,6 +262,8 @@ def why_refused(path: Path) -> str:
         mode = path.lstat().st_mode
     except OSError as error:
         return f"{error.strerror or error}: check the path"
+    except ValueError:
+        return "this is no path: name a recording"
     if stat.S_ISLNK(mode):
         return "symbolic links are not followed: name the file itself"
     return "" if stat.S_ISREG(mode) else "this is no plain file: name a recording"
@@ -315,10 +344,12 @@ def _sized(item: Item, columns: Sequence[str]) -> Item:
 def channel_columns(table: Mapping[str, Any]) -> list[str]:
     """The columns of every channel that a `[recording]` table names, as far as that can be told."""
     names: list[str] = []
-    for channel in ("position", "torque", "velocity", "acceleration", "force", "reference", "command", "time"):
+    channels = "position", "torque", "velocity", "acceleration", "force", "reference", "command", "time", "sample_rate"
+    for channel in channels:
         entry = table.get(channel)
         entry = entry.get("column") if isinstance(entry, Mapping) else entry
-        names += [entry] if isinstance(entry, str) else [name for name in entry or () if isinstance(name, str)]
+        several = entry if isinstance(entry, list | tuple) else ()
+        names += [entry] if isinstance(entry, str) else [name for name in several if isinstance(name, str)]
     return names
 
 

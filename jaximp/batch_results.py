@@ -12,11 +12,12 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -24,13 +25,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jaximp.batch_plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
-from jaximp.identify import Estimates, identify_recording, in_windows
+from jaximp.batch_plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, printable, why_refused
+from jaximp.identify import Estimates, Prepared, in_windows, prepare
 from jaximp.job import Job
 from jaximp.least_squares import SlidingFit, confidence_interval
 from jaximp.models import Joints, Model, pathway_of
 from jaximp.pages import table_of, versions
-from jaximp.readers import RecordingError, count_samples
+from jaximp.readers import MATRICES, RecordingError, UnavailableError, count_samples
 from jaximp.recordings import recording_from_mapping
 from jaximp.regression import design_filters
 from jaximp.report import estimates_table
@@ -68,18 +69,37 @@ class Task:
     metadata: tuple[str, ...]
     partitions: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
+    joints: int
+    """Of every recording."""
     reports: str | tuple[str, ...] = "none"
     """`all`, `failed` (recordings without a trusted window), `none`, or the names of some."""
 
     @classmethod
     def of(cls, job: Job, plan: Plan, out: Path, reports: str | tuple[str, ...] = "none") -> Task:
-        return cls(job, out, plan.metadata, plan.partitions, plan.sizes, reports)
+        return cls(job, out, plan.metadata, plan.partitions, plan.sizes, joints_of(job, plan.items), reports)
 
     def key(self, batch: Batch) -> str:
         """Checksum of everything that a batch's results depend on, its inputs' content apart."""
         members = [(item.name, item.metadata, str(item.robot_file or ""), item.refused) for item in batch.items]
-        about = [job_checksum(self.job), versions(), self.partitions, self.metadata, self.sizes, batch.padded, members]
+        study = [job_checksum(self.job), versions(), self.partitions, self.metadata, self.sizes, self.joints]
+        about = [*study, batch.padded, members]
         return checksum(json.dumps(about, sort_keys=True).encode())
+
+
+class About(NamedTuple):
+    """Of a recording that could be read."""
+
+    joints: tuple[str, ...]
+    samples: int
+    sample_rate: float
+    duration: float
+    """[s]"""
+    valid_share: float
+
+    @classmethod
+    def of(cls, one: Recording) -> About:
+        duration = float(one.time[-1] - one.time[0])
+        return cls(one.joints, len(one), one.sample_rate, duration, float(one.valid.mean()))
 
 
 @dataclass
@@ -90,6 +110,8 @@ class Result:
     estimates: list[Estimates] = field(default_factory=list)
     """One for each method; none where it failed."""
     recording: Recording | None = None
+    about: About | None = None
+    """What remains of the recording."""
     stacked: tuple[Any, Measured] | None = None
     """The program that solves it, and what goes into that; nothing where it is identified by itself."""
     reason: str = ""
@@ -117,10 +139,10 @@ def file_checksum(path: Path | None) -> str:
 
 
 def job_checksum(job: Job) -> str:
-    """Of the job file and of the design that it names."""
-    design = "" if job.design is None else file_checksum(job.folder / job.design)
+    """Of the job file, and of the design and the robot's recording that it names."""
+    design = "" if job.design is None else file_checksum((job.folder / job.design).resolve())
     robot = (job.robot_recording or {}).get("file")
-    alone = "" if robot is None else file_checksum(job.folder / str(robot))
+    alone = "" if robot is None else file_checksum((job.folder / str(robot)).resolve())
     return checksum("\n".join([job.text, design, alone]).encode())
 
 
@@ -132,18 +154,25 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
     **Raises:** `Interrupted` if it is to stop, `OSError` where results cannot be written. What is wrong with a
     recording raises nothing: the receipt says it.
     """
-    begin = time.perf_counter()
-    results = [_read(task, batch, item) for item in batch.items]
+    begin, key = time.perf_counter(), task.key(batch)
+    results, unwritten = list[Result](), dict[str, str]()
+    for item in batch.items:
+        result = _read(task, batch, item)
+        if result.stacked is None and result.recording is not None:
+            _solve_alone(task, result)
+            unwritten |= _write_reports(task, [result])
+            result.recording = None  # what is identified by itself may be long
+        results.append(result)
+        if stopped():
+            raise Interrupted
+    _solve_stacks(task, results)
     if stopped():
         raise Interrupted
-    _solve(task, results)
-    if stopped():
-        raise Interrupted
-    unwritten = _write_reports(task, results)
+    unwritten |= _write_reports(task, results)
     outputs = _write_tables(task, batch, results)
     receipt = {
         "batch": batch.number,
-        "key": task.key(batch),
+        "key": key,
         "inputs": {result.item.name: result.sha256 for result in results},
         "outputs": outputs,
         "failed": [failure(result.item, result.reason) for result in results if result.status == FAILED],
@@ -157,7 +186,8 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
 
 def failure(item: Item, reason: str) -> dict[str, Any]:
     """One line of the quarantine."""
-    return {"recording": item.name, "file": str(item.file), "reason": reason, "metadata": dict(item.metadata)}
+    about = {"recording": item.name, "file": printable(str(item.file)), "reason": printable(reason)}
+    return about | {"metadata": dict(item.metadata)}
 
 
 def receipt_path(out: Path, batch: Batch) -> Path:
@@ -205,7 +235,13 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
     result = Result(item, sha256=_input_checksum(item), reason=item.refused)
     if not result.reason:
         with _reasons(result):
-            result.recording = recording = _load(task.job.recording, item.file, task.job.folder)
+            recording = _load(task.job.recording, item.file, task.job.folder)
+            if recording.n_joints != task.joints:
+                raise ValueError(
+                    f"{item.file}: it has {recording.n_joints} joints, but this study {task.joints}: name the columns "
+                    "of each joint, or make a study of its own"
+                )
+            result.recording, result.about = recording, About.of(recording)
             size = next((size for size in task.sizes if size[0] >= len(recording)), None)
             if batch.padded and size is not None:
                 found = measure(task.job, recording)
@@ -219,7 +255,10 @@ def _load(table: Mapping[str, Any], file: Path, folder: Path) -> Recording:
     refused = why_refused(file)
     if refused:
         raise RecordingError(f"{file}: {refused}")
-    samples = count_samples(file, channel_columns(table))
+    try:
+        samples = count_samples(file, channel_columns(table))
+    except RecordingError as error:
+        raise RecordingError(f"{file}: {error}") from None
     if samples > MOST_SAMPLES:
         raise RecordingError(f"{file}: it claims {samples:.3g} samples, above {MOST_SAMPLES:.3g}: cut it into parts")
     return recording_from_mapping({**table, "file": os.path.abspath(file)}, folder)
@@ -236,6 +275,10 @@ class _reasons:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
         if not isinstance(error, Exception) or isinstance(error, MemoryError):
             return False
+        if "RESOURCE_EXHAUSTED" in str(error):
+            return False  # XLA's way to say it
+        if isinstance(error, OSError | UnavailableError):
+            self.result.sha256 = ""  # another run is to try again
         expected = isinstance(error, ValueError | OSError)
         text = " ".join(str(error).split())
         self.result.reason = text if expected else f"{type(error).__name__}: {text}"
@@ -243,21 +286,30 @@ class _reasons:
         return True
 
 
-def _solve(task: Task, results: Sequence[Result]) -> None:
-    """Estimates of every recording that could be read, or the reason why there are none."""
+def _solve_alone(task: Task, result: Result) -> None:
+    """Estimates of a recording that is not stacked, or the reason why there are none."""
+    begin = time.perf_counter()
+    if result.recording is not None and not result.reason:
+        with _reasons(result), _one_at_a_time:
+            prepared = prepare(task.job, result.recording, _alone(task, result.item))
+            result.estimates = in_windows(task.job, prepared, curves=False)
+    result.seconds += time.perf_counter() - begin
+
+
+def _solve_stacks(task: Task, results: Sequence[Result]) -> None:
+    """Estimates of every recording that is stacked, or the reason why there are none."""
     job, stacks = task.job, dict[Any, list[tuple[Result, Measured]]]()
     for result in results:
-        begin = time.perf_counter()
         if result.stacked is not None:
             program, found = result.stacked
             stacks.setdefault(program, []).append((result, found))
-        elif result.recording is not None and not result.reason:
-            with _reasons(result), _one_at_a_time:
-                result.estimates = identify_recording(job, result.recording, _alone(task, result.item))
-        result.seconds += time.perf_counter() - begin
     for (layout, _), members in stacks.items():
         begin = time.perf_counter()
-        prepared = solve_stack(job, [found for _, found in members], layout)
+        prepared: Sequence[Prepared | ValueError]
+        try:
+            prepared = solve_stack(job, [found for _, found in members], layout)
+        except ValueError as error:
+            prepared = [error] * len(members)
         share = (time.perf_counter() - begin) / len(members)
         for (result, _), one in zip(members, prepared, strict=True):
             begin = time.perf_counter()
@@ -268,17 +320,36 @@ def _solve(task: Task, results: Sequence[Result]) -> None:
             result.seconds += share + time.perf_counter() - begin
 
 
+def joints_of(job: Job, items: Sequence[Item]) -> int:
+    """Joints of a study: as many as the job names, or, where a variable may hold several, those of the first recording
+    that can be read."""
+    named = _named_joints(job)
+    for item in items if named == 1 else ():
+        if item.file.suffix.lower() not in MATRICES:
+            return named
+        with suppress(ValueError, OSError):
+            return _load(job.recording, item.file, job.folder).n_joints
+    return named
+
+
+def _named_joints(job: Job) -> int:
+    position = job.recording.get("position")
+    position = position.get("column") if isinstance(position, Mapping) else position
+    return 1 if isinstance(position, str) else len(position or "1")
+
+
 def _alone(task: Task, item: Item) -> Recording | None:
     """The recording of the robot alone: the manifest's, or the job's."""
     table = task.job.robot_recording
     if table is None:
         return None
     file = item.robot_file or task.job.folder / str(table["file"])
-    return _robot_alone(json.dumps(dict(table), sort_keys=True), file, task.job.folder)
+    return _robot_alone(json.dumps(dict(table), sort_keys=True), file, task.job.folder, file_checksum(file))
 
 
 @lru_cache(maxsize=4)
-def _robot_alone(table: str, file: Path, folder: Path) -> Recording:
+def _robot_alone(table: str, file: Path, folder: Path, content: str) -> Recording:
+    """A file of this content is read once."""
     return _load(json.loads(table), file, folder)
 
 
@@ -314,9 +385,9 @@ def windows_table(job: Job, results: Sequence[Result], k: int = 0) -> pa.Table:
     `condition` is called `condition_number` here: a study has conditions of its own, which partition its results.
     """
     several = [result.estimates[k] for result in results]
-    recording = results[0].recording
-    assert recording is not None
-    human = job.models(recording.joints, recording.sample_rate)[1]
+    about = results[0].about
+    assert about is not None
+    human = job.models(about.joints, about.sample_rate)[1]
     table = estimates_table(_one_after_another(several), human, job)
     table = table.rename_columns({"condition": "condition_number"})
     names = pa.array(np.repeat([result.item.name for result in results], [len(one.start) for one in several]))
@@ -359,14 +430,14 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     ]
     metadata = [dict(result.item.metadata) for result in results]
     columns += [(name, "", _texts(row.get(name, "") for row in metadata)) for name in task.metadata]
-    measured = [result.recording for result in results]
+    measured = [result.about for result in results]
     columns += [
         ("status", "", _texts(result.status for result in results)),
         ("reason", "", _texts(result.reason for result in results)),
-        ("samples", "1", np.array([0 if r is None else len(r) for r in measured])),
+        ("samples", "1", np.array([0 if r is None else r.samples for r in measured])),
         ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in measured)),
-        ("duration_s", "s", _numbers(r and r.time[-1] - r.time[0] for r in measured)),
-        ("valid_share", "1", _numbers(r and r.valid.mean() for r in measured)),
+        ("duration_s", "s", _numbers(r and r.duration for r in measured)),
+        ("valid_share", "1", _numbers(r and r.valid_share for r in measured)),
         ("windows", "1", np.array([len(r.estimates[0].start) if r.estimates else 0 for r in results])),
     ]
     counts = [r.estimates[0].verdicts.counts() if r.estimates else dict.fromkeys(VERDICTS, 0) for r in results]
@@ -411,21 +482,19 @@ def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.flo
 def reserved_columns(job: Job) -> set[str]:
     """Names that a manifest's columns cannot have: those of the results."""
     nothing = [Result(Item("", Path()))]
-    table, model = recordings_table(Task(job, Path(), (), (), ()), nothing), _model_of(job, nothing)
+    table, model = recordings_table(Task(job, Path(), (), (), (), 0), nothing), _model_of(job, nothing)
     parameters = () if model is None else model.names
     return {*table.column_names, *WINDOW_COLUMNS, *parameters, *(f"{name}_stderr" for name in parameters)}
 
 
 def _model_of(job: Job, results: Sequence[Result]) -> Model | None:
     """What is identified: of the recordings that could be read, or as the job's columns suggest."""
-    first = next((result.recording for result in results if result.recording is not None), None)
+    first = next((result.about for result in results if result.about is not None), None)
     joints = None if first is None else first.joints
     rate = ANY_RATE if first is None else first.sample_rate
     if joints is None:
-        position, joint = job.recording.get("position"), job.recording.get("joint", "revolute")
-        position = position.get("column") if isinstance(position, Mapping) else position
-        n = 1 if isinstance(position, str) else len(position or "1")
-        joints = tuple(joint) if isinstance(joint, list) else (joint,) * n
+        joint = job.recording.get("joint", "revolute")
+        joints = tuple(joint) if isinstance(joint, list) else (joint,) * _named_joints(job)
     try:
         robot, human = job.models(joints, rate)
     except (ValueError, KeyError):
@@ -447,8 +516,8 @@ def _summarised(model: Model) -> list[tuple[str, str]]:
     return [*kept, *gains]
 
 
-def _filters(job: Job, recording: Recording | None) -> str:
-    rate = None if recording is None else recording.sample_rate
+def _filters(job: Job, about: About | None) -> str:
+    rate = None if about is None else about.sample_rate
     try:
         decimate = job.filter.decimate if rate is None else design_filters(job.filter, rate).decimate
     except ValueError:
@@ -457,7 +526,7 @@ def _filters(job: Job, recording: Recording | None) -> str:
 
 
 def _texts(values: Any) -> Any:
-    return pa.array(list(values), pa.string())
+    return pa.array([printable(text) for text in values], pa.string())
 
 
 def _numbers(values: Any) -> Any:
@@ -471,6 +540,7 @@ def _numbers(values: Any) -> Any:
 def report_folder(out: Path, name: str) -> Path:
     """Where the report of a recording stands; what is no plain letter in its name is percent-encoded."""
     plain = quote(name, safe="")
+    plain = plain.replace(".", "%2E", plain.startswith("."))
     return out / "reports" / (plain if len(plain) < 200 else checksum(name.encode()))
 
 
@@ -512,7 +582,7 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
 
 def write_report_of(job: Job, recording: Recording, alone: Recording | None, folder: Path) -> None:
     """What `identify` writes, for one recording."""
-    from jaximp.identify import at_other_lengths, prepare
+    from jaximp.identify import at_other_lengths
     from jaximp.outputs import new_folder
     from jaximp.report import write_results
 

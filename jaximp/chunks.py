@@ -23,7 +23,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp.compilation import compiled
-from jaximp.engine import BLOCK, ChunkFit, Plan, Statistics, Wanted, solve_chunk, solve_shortest
+from jaximp.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, Statistics, Wanted, solve_chunk, solve_shortest
 from jaximp.least_squares import SlidingFit, WindowFit, solve_window
 from jaximp.types import AnyArray
 
@@ -89,7 +89,7 @@ def make_task(
     lanes = max(LANES[statistics], room)
     if n_windows is not None:  # a short recording needs no long chunk, but few lengths share compiled code
         enough = -(-n_windows // per_block)
-        lanes = min(lanes, next((size for size in (30, 120, 480) if size >= enough), lanes))
+        lanes = min(lanes, next((size for size in (FEWEST_LANES, 120, 480) if size >= enough), lanes))
     lags = 0 if noise is None else len(noise)
     return Task(Plan(step, per_block, lanes, room, outputs, statistics, weighted, lags), window, noise)
 

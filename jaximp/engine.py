@@ -43,6 +43,8 @@ from jaxtyping import Array
 
 BLOCK = 16
 """Rows in a block, at least."""
+FEWEST_LANES = 30
+"""XLA breaks off the whole process where it compiles the barriers for only a few lanes."""
 DOUBT = 1e-2
 """A pivot below this share of its column leaves the window's estimate to a QR decomposition."""
 WELL_CONDITIONED = 4e7

@@ -102,7 +102,8 @@ def write_overview(
     that the table does not have.
     """
     names = _checked_names(recordings, groups, {"series": series or {}, "links": links or {}})
-    parameters = [name.removesuffix("_mean") for name in recordings.column_names if name.endswith("_mean")]
+    means = [one.name for one in recordings.schema if one.name.endswith("_mean") and pa.types.is_floating(one.type)]
+    parameters = [name.removesuffix("_mean") for name in means]
     if parameter is None and parameters:
         parameter = plots.main_parameter(parameters)
     if parameter is not None and parameter not in parameters:

@@ -6,6 +6,8 @@ pyarrow, h5py and scipy take long to import and are imported where they are need
 from __future__ import annotations
 
 import csv
+import os
+import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
@@ -14,9 +16,20 @@ import numpy as np
 
 from jaximp.types import nearest
 
+MOST_COLUMNS = 1000
+"""A variable with more in both directions is no recording."""
+MOST_NUMBERS = 1_000_000_000
+"""A struct that holds more is not unpacked to count them."""
+COMPRESSED = 15
+"""How a MATLAB v5 file marks what it compressed."""
+
 
 class RecordingError(ValueError):
     """A measurement that cannot be used: one line with the cause and the remedy."""
+
+
+class UnavailableError(RecordingError):
+    """A file that could not be read just now, whatever is in it."""
 
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
@@ -26,11 +39,13 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
         raise RecordingError(f"cannot read '{path.suffix}' files; use one of: {', '.join(_READERS)}")
     try:
         return reader(path, list(dict.fromkeys(names)))
-    except RecordingError:
+    except (RecordingError, MemoryError):
         raise
     except UnicodeDecodeError:
         raise RecordingError("is not UTF-8 text; save it with that encoding") from None
     except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise UnavailableError(f"cannot be read ({os.strerror(error.errno)}); mend that and try again") from None
         cause = " ".join(str(error).split())[:100] or type(error).__name__
         remedy = "the file is damaged, cut short or of another kind; write it anew"
         raise RecordingError(f"cannot be read as {path.suffix} ({cause}): {remedy}") from None
@@ -39,13 +54,15 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
 def count_samples(path: Path, names: list[str]) -> int:
     """How many samples a file says that it holds of some columns, without reading them: zero where it does not say.
 
-    **Raises:** `RecordingError` as `read_columns`.
+    **Raises:** `RecordingError` for a variable that must not be read. What else is wrong, `read_columns` says.
     """
     counter = _COUNTERS.get(path.suffix.lower())
     try:
         return 0 if counter is None else counter(path, names)
-    except Exception as error:
-        raise RecordingError(f"cannot be read ({' '.join(str(error).split())[:100]})") from None
+    except (RecordingError, MemoryError):
+        raise
+    except Exception:
+        return 0
 
 
 def _lines(path: Path, names: list[str]) -> int:
@@ -61,13 +78,23 @@ def _parquet_rows(path: Path, names: list[str]) -> int:
     from pyarrow import parquet
 
     with path.open("rb") as file:
-        return int(parquet.read_metadata(file).num_rows)
+        about = parquet.read_metadata(file)
+    # Whoever reads believes the parts, not the whole.
+    groups = [about.row_group(k) for k in range(about.num_row_groups)]
+    longest = [
+        max([group.num_rows, *(group.column(j).num_values for j in range(group.num_columns))]) for group in groups
+    ]
+    return max(int(about.num_rows), sum(longest))
 
 
 def _largest(shapes: dict[str, tuple[int, ...]], names: list[str]) -> int:
     """The most numbers along any axis of a variable that is wanted: time is the longest."""
     heads = {name.split(".")[0] for name in names} | set(names)
-    return max((max(shape, default=0) for name, shape in shapes.items() if name in heads), default=0)
+    wanted = {name: shape for name, shape in shapes.items() if name in heads}
+    for name, shape in wanted.items():
+        if len(shape) > 1 and sorted(shape)[-2] > MOST_COLUMNS:
+            raise RecordingError(f"{name!r} has shape {shape}: a recording has (samples, joints)")
+    return max((max(shape, default=0) for shape in wanted.values()), default=0)
 
 
 def _mat_samples(path: Path, names: list[str]) -> int:
@@ -77,15 +104,30 @@ def _mat_samples(path: Path, names: list[str]) -> int:
         return _hdf5_samples(path, [name.replace(".", "/") for name in names])
     from scipy.io import whosmat
 
-    return _largest({name: shape for name, shape, _ in whosmat(path)}, names)
+    unpacked = _check_complete_mat(path)
+    shapes = {name: shape for name, shape, _ in whosmat(path)}
+    inside = [name for name in names if "." in name and name.split(".")[0] in shapes]
+    if inside and unpacked > 8 * MOST_NUMBERS:
+        return unpacked // 8
+    # A struct tells its fields' shapes to nobody who does not unpack it.
+    return _largest(shapes | {name: np.shape(column) for name, column in _read_mat(path, inside).items()}, names)
 
 
 def _hdf5_samples(path: Path, names: list[str]) -> int:
     import h5py
 
     with h5py.File(path, "r") as file:
-        found = {name: file.get(name) for name in names}
-        return _largest({name: item.shape for name, item in found.items() if isinstance(item, h5py.Dataset)}, names)
+        return _largest({name: _own(file, name).shape for name in names if name in file}, names)
+
+
+def _own(file: Any, name: str) -> Any:
+    """A dataset whose numbers are in the file itself."""
+    import h5py
+
+    found = file[name]
+    if isinstance(found, h5py.Dataset) and (found.file != file or found.external or found.is_virtual):
+        raise RecordingError(f"{name!r} lies in another file; copy its numbers into this one")
+    return found
 
 
 def _npz_samples(path: Path, names: list[str]) -> int:
@@ -203,17 +245,26 @@ def _read_mat(path: Path, names: list[str]) -> dict[str, Any]:
     return {name: _mat_field(content, name) for name in names}
 
 
-def _check_complete_mat(path: Path) -> None:
-    """Follow the variables of a MATLAB v5 file by their lengths: scipy reads a file that was cut as one with fewer."""
-    size = path.stat().st_size
+def _check_complete_mat(path: Path) -> int:
+    """Follow the variables of a MATLAB v5 file by their lengths: scipy reads a file that was cut as one with fewer.
+
+    **Returns:** how many bytes they say that they unpack to.
+    """
+    size, unpacked = path.stat().st_size, 0
     with path.open("rb") as file:
         order: Literal["little", "big"] = "little" if file.read(128)[126:128] == b"IM" else "big"
         position = 128
         while position < size:
-            file.seek(position + 4)
-            position += 8 + int.from_bytes(file.read(4), order)
+            file.seek(position)
+            kind, length = (int.from_bytes(file.read(4), order) for _ in range(2))
+            position += 8 + length
+            if kind == COMPRESSED:
+                head = zlib.decompressobj().decompress(file.read(min(length, 4096)), 8)
+                length = int.from_bytes(head[4:], order)
+            unpacked += length
     if position > size:
         raise RecordingError("the file ends in the middle of a variable: it was cut, copy it again")
+    return unpacked
 
 
 def _mat_field(content: dict[str, Any], name: str) -> Any:
@@ -237,7 +288,7 @@ def _read_hdf5(path: Path, names: list[str], matlab: bool = False) -> dict[str, 
         for name in names:
             if not isinstance(file.get(name), h5py.Dataset):
                 _require(name.replace("/", ".") if matlab else name, datasets(file))
-            if file[name].attrs.get("MATLAB_class") == b"char":
+            if _own(file, name).attrs.get("MATLAB_class") == b"char":
                 raise RecordingError(f"variable {name!r} holds text, not numbers; name a numeric variable")
         return {name: file[name][()] for name in names}
 
@@ -266,6 +317,8 @@ _READERS: dict[str, Callable[[Path, list[str]], dict[str, Any]]] = {
 
 FORMATS = tuple(_READERS)
 """Extensions of files that can be read."""
+MATRICES = (".mat", ".h5", ".hdf5", ".npz")
+"""Those in which one variable may hold several columns."""
 
 
 def _require(name: str, available: Iterable[str], what: str | None = None) -> None:

@@ -45,6 +45,8 @@ GAP = 1.5
 """An interval longer than this many median intervals is a gap."""
 LARGEST_GROWTH = 50
 """The uniform grid has at most this many samples for each measured one."""
+MOST_GRID = 1_000_000_000
+"""Samples of a uniform grid at most."""
 
 _SI = {
     "revolute": {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2", "torque": "N m", "command": "N m"},
@@ -173,7 +175,7 @@ def _named(where: str) -> Iterator[None]:
     try:
         yield
     except RecordingError as error:
-        raise RecordingError(f"{where}: {error}") from None
+        raise type(error)(f"{where}: {error}") from None
 
 
 def _read_signals(
@@ -617,10 +619,10 @@ def _on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], 
     if not 1e-9 < median < 1e6:
         raise RecordingError(f"the median interval of {median:.3g} s is no sampling interval; correct the unit of time")
     longest = int(np.argmax(intervals))
-    if not growth <= LARGEST_GROWTH:
+    if not growth <= LARGEST_GROWTH or growth * len(stamps) > MOST_GRID:
         raise RecordingError(
-            f"the gap of {intervals[longest]:.6g} s after row {longest + 1} would fill the uniform grid with more than "
-            f"{LARGEST_GROWTH} times as many samples as were measured; split the recording there, or repair the stamps"
+            f"the gap of {intervals[longest]:.6g} s after row {longest + 1} would fill the uniform grid with "
+            f"{growth:.3g} times as many samples as were measured; split the recording there, or repair the stamps"
         )
     time, samples, valid, notes = _placed(stamps, samples, valid, median) or _resampled(stamps, samples, valid, median)
     gaps = int((intervals > GAP * median).sum())

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.chunks import LONGEST_REACH, Task, finish
 from jaximp.compilation import compiled
-from jaximp.engine import BLOCK, ChunkFit, Plan, solve_chunk
+from jaximp.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, solve_chunk
 from jaximp.identify import Prepared, Solved, checked_models, moments, reference_motion
 from jaximp.job import Job
 from jaximp.least_squares import variance_accounted_for
@@ -289,7 +289,7 @@ def _plan(layout: Layout, outputs: int, p: int) -> Plan | None:
     if layout.lags and (reach > LONGEST_REACH or 2 * reach > window):
         return None
     per_block = max(1, min(BLOCK // step, window // step))
-    lanes = -(-len(window_starts(layout.rows, layout.window, layout.step)) // per_block)
+    lanes = max(FEWEST_LANES, -(-len(window_starts(layout.rows, layout.window, layout.step)) // per_block))
     room = -(-window // (step * per_block))
     ahead = window // step if window % step == 0 else 0
     return Plan(step, per_block, lanes, room, outputs, True, False, layout.lags, ahead)
