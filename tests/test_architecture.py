@@ -138,3 +138,14 @@ def test_importing_the_library_leaves_jax_as_it_is() -> None:
     environment = {key: value for key, value in os.environ.items() if key != "JAX_ENABLE_X64"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
+
+
+def test_nothing_is_pickled() -> None:
+    """Files from elsewhere are data: whoever unpickles one runs it."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        nodes = [
+            node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import | ast.ImportFrom)
+        ]
+        imported = {alias.name for node in nodes for alias in node.names}
+        assert not imported & {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}, path.name
+        assert "allow_pickle=True" not in path.read_text(), path.name

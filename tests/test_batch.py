@@ -5,11 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -19,7 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 from browser import browser, executable
 
-from jaximp import batch, batch_plan, batch_results, stacks, windows
+from jaximp import batch, batch_plan, batch_results, readers, stacks, windows
 from jaximp.batch_plan import find_items, make_plan, padded_sizes
 from jaximp.identify import Estimates, identify_recording, in_windows
 from jaximp.job import Job, parse_job, read_job
@@ -179,6 +181,18 @@ def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
         assert not isinstance(other, ValueError)
         np.testing.assert_array_equal(one.solved[0].fit.theta, other.solved[0].fit.theta)
         np.testing.assert_array_equal(one.solved[0].fit.stderr, other.solved[0].fit.stderr)
+
+
+def test_one_window_as_long_as_the_recording() -> None:
+    """A program of a few windows only once made XLA break off the process."""
+    job = parse_job(JOB.replace("decimation_cutoff = 10", "").replace("length = 1", "length = 4"))
+    recording = joint(1000)
+    measured = stacks.measure(job, recording)
+    found = stacks.solve_stack(job, [measured], measured.layout(job, 1000, 1))[0]
+    assert not isinstance(found, ValueError)
+    theta = in_windows(job, found, curves=False)[0].fit.theta
+    assert len(theta) == 1
+    np.testing.assert_allclose(theta, identify_recording(job, recording)[0].fit.theta, 1e-9)
 
 
 def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
@@ -445,6 +459,31 @@ def vanished_file(fault: Fault, out: Path) -> None:
     assert [failed["recording"] for failed in outcome.failed] == ["r5.parquet"]
 
 
+def no_memory_to_read(fault: Fault, out: Path) -> None:
+    """A reader's library does not get its memory: that says nothing of the file."""
+
+    def fail(path: Path, names: list[str]) -> object:
+        raise pa.ArrowMemoryError("malloc of size 8000 failed")
+
+    fault.patch.setitem(readers._READERS, ".parquet", fail)
+    assert run(fault.study, out).exit_status == 1
+
+
+def too_many_files(fault: Fault, out: Path) -> None:
+    """Files cannot be opened for a while."""
+    original = readers._READERS[".parquet"]
+
+    def fail(path: Path, names: list[str]) -> object:
+        if path.name == "r3.parquet":
+            raise OSError(errno.EMFILE, "Too many open files")
+        return original(path, names)
+
+    fault.patch.setitem(readers._READERS, ".parquet", fail)
+    outcome = run(fault.study, out)
+    assert outcome.exit_status == 3
+    assert "Too many open files" in outcome.failed[0]["reason"]
+
+
 def damaged_result(fault: Fault, out: Path) -> None:
     """A file of results is cut, another one is lost."""
     run(fault.study, out)
@@ -473,7 +512,8 @@ def killed_process(fault: Fault, out: Path) -> None:
 
 
 FAULTS = [
-    full_disk, interrupt, out_of_memory, vanished_file, damaged_result, damaged_receipt, killed_process,
+    full_disk, interrupt, out_of_memory, no_memory_to_read, vanished_file, too_many_files, damaged_result,
+    damaged_receipt, killed_process,
 ]  # fmt: skip
 
 
@@ -490,6 +530,103 @@ def test_nothing_is_lost_and_nothing_differs(
     assert outcome.exit_status == 0
     assert set(expected) - set(found) == set(), "lost"
     assert [name for name in found if found[name] != expected.get(name)] == [], "differs"
+
+
+def test_what_a_batch_did_not_write_stays(study: Path, tmp_path: Path) -> None:
+    """But for drafts of reports that were broken off."""
+    out = tmp_path / "out"
+    shutil.copytree(study / "reference", out)
+    own = [out / name for name in ("notes.txt", "recordings_raw/a.parquet", "estimates_old/batch-00000.parquet")]
+    own.append(out / "estimates" / "readme.txt")
+    for path in own:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    draft = out / "reports" / ".r0.parquet.x7"
+    draft.mkdir(parents=True)
+    assert run(study, out, resume=True).skipped == len(LENGTHS)
+    assert all(path.read_text() == "mine" for path in own)
+    assert not draft.exists()
+
+
+@pytest.mark.parametrize("name", [".", "..", ".hidden", "a/../..", "x.csv"])
+def test_a_report_stands_in_a_folder_of_its_own(tmp_path: Path, name: str) -> None:
+    folder = batch_results.report_folder(tmp_path, name)
+    assert folder.resolve().parent == tmp_path / "reports"
+    assert not folder.name.startswith(".")
+
+
+def test_results_are_no_recordings(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of an earlier run, in the folder that is searched."""
+    monkeypatch.chdir(study)
+    for given in (".", str(study), "**/*.parquet"):
+        names = {item.name for item in find_items([given])} - {"study.csv"}
+        assert names == {f"r{k}.parquet" for k in range(len(LENGTHS))}
+
+
+def test_a_full_disk_below_the_log_ends_no_run(tmp_path: Path) -> None:
+    (tmp_path / "batch.log").symlink_to("/dev/full")
+    told: list[dict[str, object]] = []
+    with batch._log(tmp_path, told.append) as log:
+        log({"event": "plan"})
+    assert told == [{"event": "plan"}]
+
+
+def test_a_new_recording_of_the_robot_is_read(tmp_path: Path) -> None:
+    text = JOB.replace("human = true", "human = true\nrobot = { gravity = false, coulomb = false }\nmethods = [1]")
+    text += '[robot_recording]\nfile = "alone.parquet"\n' + "".join(JOB.splitlines(keepends=True)[3:6])
+    job = parse_job(text)
+    item = batch_plan.Item("x", tmp_path / "x.parquet", robot_file=tmp_path / "alone.parquet")
+    task = batch_results.Task(job, tmp_path, (), (), (), 1)
+    for seed in (1, 2):
+        recording = joint(1000, seed)
+        save_recording(recording, tmp_path / "alone.parquet")
+        found = batch_results._alone(task, item)
+        assert found is not None
+        np.testing.assert_array_equal(found.torque, recording.torque)
+
+
+def test_a_design_behind_a_link_belongs_to_the_job(tmp_path: Path) -> None:
+    (tmp_path / "design.json").write_text("{}")
+    (tmp_path / "link.json").symlink_to("design.json")
+    job = replace(parse_job(JOB, tmp_path), design="link.json")
+    before = batch_results.job_checksum(job)
+    (tmp_path / "design.json").write_text("[]")
+    assert batch_results.job_checksum(job) != before
+
+
+def test_all_recordings_of_a_study_have_the_same_joints(tmp_path: Path) -> None:
+    """Two in one variable, where the first recording has one."""
+    for k, one in enumerate((joint(1000), beside(joint(1000), joint(1000, 1)))):
+        np.savez(tmp_path / f"r{k}.npz", time_s=one.time, position_rad=one.position, torque_Nm=one.torque)
+    job = parse_job(JOB, tmp_path)
+    plan = make_plan(job, find_items([str(tmp_path)]))
+    task = batch_results.Task.of(job, plan, tmp_path)
+    found = [batch_results._read(task, plan.batches[0], item) for item in plan.items]
+    assert [result.reason[-50:] for result in found if result.reason] == [found[1].reason[-50:]]
+    assert "it has 2 joints, but this study 1" in found[1].reason
+
+
+def test_what_stops_a_stack_is_said_of_its_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: object) -> object:
+        raise ValueError("no such window")
+
+    monkeypatch.setattr(batch_results, "solve_stack", refuse)
+    job, recording = parse_job(JOB), joint(1000)
+    measured = stacks.measure(job, recording)
+    result = batch_results.Result(batch_plan.Item("x", Path("x")), recording=recording)
+    result.stacked = (measured.layout(job, 1000, 1), measured.model), measured
+    batch_results._solve_stacks(batch_results.Task(job, Path(), (), (), (), 1), [result])
+    assert (result.status, result.reason) == (batch_results.FAILED, "no such window")
+
+
+def test_a_name_that_is_no_text_can_be_told(tmp_path: Path) -> None:
+    save_recording(joint(1000), tmp_path / "r0.parquet")
+    (tmp_path / "r0.parquet").rename(os.fsdecode(os.fsencode(tmp_path) + b"/r\xff.parquet"))
+    items = find_items([str(tmp_path)])
+    assert [item.name for item in items] == ["r\\udcff.parquet"]
+    told = batch_results.failure(items[0], "damaged")
+    assert json.dumps(told).encode("ascii")
+    assert batch_results._texts([str(items[0].file)]).to_pylist() == [told["file"]]
 
 
 def test_a_second_resume_does_nothing_again(study: Path, tmp_path: Path) -> None:
@@ -629,9 +766,92 @@ def test_a_recording_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatc
     assert "claims 1e+12 samples" in outcome.failed[0]["reason"]
 
 
+def test_a_struct_is_counted_by_what_it_unpacks_to(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    one = joint(1000)
+    data = {"t": one.time, "q": one.position, "tau": one.torque}
+    savemat(tmp_path / "s.mat", {"data": data, "other": np.zeros((3, 2000))}, do_compression=True)
+    assert readers.count_samples(tmp_path / "s.mat", ["data.t", "data.q", "data.tau"]) == 1000
+
+
+def test_a_struct_that_unpacks_to_too_much_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"data": {"t": np.zeros(200_000)}}, do_compression=True)
+    monkeypatch.setattr(readers, "MOST_NUMBERS", 100_000)
+    monkeypatch.setattr(readers, "_read_mat", lambda *args: pytest.fail("it was read") if args[1] else {})
+    assert readers.count_samples(tmp_path / "s.mat", ["data.t"]) > 100_000
+
+
+def test_the_variable_of_the_sample_rate_is_counted_too(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "r.npz", q=np.zeros(10), tau=np.zeros(10), fs=np.zeros(20_000))
+    table = {"position": "q", "torque": "tau", "sample_rate": "fs"}
+    assert readers.count_samples(tmp_path / "r.npz", batch_plan.channel_columns(table)) == 20_000
+
+
+def square(folder: Path) -> None:
+    import h5py
+
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("torque_Nm", (9000, 9000), chunks=(1000, 1000), dtype="f8")
+
+
+def linked(folder: Path) -> None:
+    import h5py
+
+    with h5py.File(folder / "elsewhere.hdf", "w") as file:
+        file["torque"] = np.arange(1000.0)
+    with h5py.File(folder / "a.h5", "w") as file:
+        file["torque_Nm"] = h5py.ExternalLink("elsewhere.hdf", "/torque")
+
+
+def device(folder: Path) -> None:
+    import h5py
+
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("torque_Nm", (1000,), "f8", external=[("/dev/zero", 0, 8000)])
+
+
+def virtual(folder: Path) -> None:
+    import h5py
+
+    layout = h5py.VirtualLayout((1000,), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "elsewhere.hdf"), "torque", (1000,))
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_virtual_dataset("torque_Nm", layout)
+
+
+@pytest.mark.parametrize("make", [square, linked, device, virtual], ids=lambda make: make.__name__)
+def test_an_hdf5_file_holds_its_own_numbers_and_no_more(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path)
+    why = "has shape" if make is square else "lies in another file"
+    with pytest.raises(readers.RecordingError, match=why):
+        readers.count_samples(tmp_path / "a.h5", ["torque_Nm"])
+    if make is not square:
+        with pytest.raises(readers.RecordingError, match=why):
+            readers.read_columns(tmp_path / "a.h5", ["torque_Nm"])
+
+
+def test_columns_may_have_the_endings_of_results(study: Path, tmp_path: Path) -> None:
+    """Of the page: a mean of somebody's own is text, and no parameter."""
+    shutil.copytree(study / "reference", tmp_path / "out")
+    for path in (tmp_path / "out" / "recordings").iterdir():
+        table = pq.ParquetFile(path).read()
+        for name in ("emg_mean", "x_median_stderr"):
+            table = table.append_column(name, pa.array(["3"] * len(table), pa.string()))
+        pq.write_table(table, path)
+    batch.write_page(tmp_path / "out", ("subject", "arm", "emg_mean", "x_median_stderr"))
+    page = (tmp_path / "out" / "overview.html").read_text()
+    assert "emg_mean" in page
+    assert "x_median_stderr" in page
+
+
 @pytest.mark.parametrize(
     ("manifest", "why"),
     [
+        ("file\na.csv\nsub/../a.csv\n", "more than once"),
+        ("file,subject, subject\na.csv,1,2\n", "same name"),
         ("subject\nS1\n", "column 'file'"),
         ("file\na.csv\na.csv\n", "more than once"),
         ("file,subject\na.csv\n", "more or fewer fields"),
@@ -650,8 +870,6 @@ def test_bad_manifests_are_refused(tmp_path: Path, manifest: str, why: str) -> N
 
 @pytest.mark.usefixtures("unchecked")
 def test_a_job_with_trials_is_refused() -> None:
-    from dataclasses import replace
-
     job = replace(parse_job(JOB), trials="anything")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="trials"):
         make_plan(job, [])
