@@ -7,6 +7,7 @@ nobody disturbed.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -281,6 +282,8 @@ def _on_threads(task: Task, batches: Sequence[Batch]) -> Found:
     """In this process: while one batch is solved, others are read and written."""
     stop = threading.Event()
     pool = ThreadPoolExecutor(cores())
+    gc.collect()
+    gc.freeze()  # what is loaded by now need not be searched for garbage again and again
 
     def solve(batch: Batch) -> dict[str, Any]:
         return solve_batch(task, batch, stop.is_set)
@@ -290,6 +293,7 @@ def _on_threads(task: Task, batches: Sequence[Batch]) -> Found:
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
+        gc.unfreeze()
 
 
 def _first_done(futures: list[Future[Any]]) -> list[Future[Any]]:

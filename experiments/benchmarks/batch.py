@@ -5,9 +5,10 @@ once over each recording. Two jobs: `decimated` (low-pass of all columns, one ro
 coloured noise) and `every sample` (low-pass of the position alone, 1 kHz rows, white noise). The loops read the same
 files with pyarrow, filter with scipy and solve every window with numpy's least squares, for theta alone or with
 standard errors (those of white noise), condition number and variance accounted for; or all windows with statsmodels'
-RollingOLS, theta alone. All is measured in one run of this script. Writes results/batch.json and .md.
+RollingOLS, theta alone. The batch's time is that of a whole run, compilation and overview among it. All is measured in
+one run of this script. Writes results/batch.json and .md.
 
-    python experiments/benchmarks/batch.py [recordings, 500 by default]
+    python experiments/benchmarks/batch.py [recordings, 10000 by default]
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -147,7 +149,9 @@ def one_run(folder: Path, job: Job, out: Path, **options: Any) -> list[tuple[flo
 
     outcome = batch.run(job, [folder / "r*.parquet"], out, tell=tell, **options)
     assert outcome.exit_status == 0
-    return [*times, (time.perf_counter() - begin, outcome.recordings)]
+    times.append((time.perf_counter() - begin, outcome.recordings))
+    shutil.rmtree(out)
+    return times
 
 
 def rate(times: list[tuple[float, int]]) -> float:
@@ -207,26 +211,24 @@ def main(count: int) -> None:
             found: dict[str, Any] = {}
             for name, function in loops.items():
                 found[f"{name}_ms"], found[f"{name}_processor_ms"] = per_file(folder, function)
-            cold = one_run(folder, job, top / f"{which}_cold")
             begin = time.process_time()
-            warm = one_run(folder, job, top / f"{which}_warm")
+            times = one_run(folder, job, top / which)
             found["batch_processor_ms"] = 1e3 * (time.process_time() - begin) / count
-            found |= {"batch_ms": 1e3 * warm[-1][0] / count, "batch_with_compilation_ms": 1e3 * cold[-1][0] / count}
+            found |= {"batch_ms": 1e3 * times[-1][0] / count, "batch_once_compiled_ms": 1e3 / rate(times)}
+            times = one_run(folder, job, top / which, workers=2)
+            found["two_workers_ms"] = 1e3 * times[-1][0] / count
+            one_worker = one_run(folder, job, top / which, workers=1)
+            found["two_workers_over_one"] = rate(times) / rate(one_worker)
             faster = min(found["loop_theta_ms"], found["rolling_ols_ms"])
             found["times_faster_than_theta_alone"] = faster / found["batch_ms"]
             found["times_faster_than_with_statistics"] = found["loop_statistics_ms"] / found["batch_ms"]
             found |= phases(folder, job, top / f"{which}_phases")
             results[which] = found
             print(which, found, flush=True)
-        job = read_job(folder / "decimated.toml")
-        rates = [rate(one_run(folder, job, top / f"workers{n}", workers=n)) for n in (1, 2)]
-        results["two_workers_over_one"] = rates[1] / rates[0]
-        simulate(top / "few", 200)
-        simulate(top / "many", 2000)
-        memory = [
-            peak_memory(top / which, top / which / "decimated.toml", top / f"m_{which}") for which in ("few", "many")
-        ]
-        results |= {"peak_mb_200": memory[0], "peak_mb_2000": memory[1], "peak_ratio": memory[1] / memory[0]}
+        job = read_job(folder / "every_sample.toml")
+        simulate(top / "few", max(1, count // 10))
+        memory = [peak_memory(one, folder / "every_sample.toml", top / "memory") for one in (top / "few", folder)]
+        results |= {"peak_mb_tenth": memory[0], "peak_mb_all": memory[1], "peak_ratio": memory[1] / memory[0]}
         simulate(top / "lengths", 1000, lengths=True)
         jax.clear_caches()
         stacks._known.clear()
@@ -245,12 +247,14 @@ def write(results: dict[str, Any]) -> None:
         ("loop, theta alone [ms]", "loop_theta_ms"),
         ("loop, with statistics [ms]", "loop_statistics_ms"),
         ("statsmodels RollingOLS, theta alone [ms]", "rolling_ols_ms"),
-        ("batch, compiled [ms]", "batch_ms"),
-        ("batch, with compilation [ms]", "batch_with_compilation_ms"),
+        ("batch, in process [ms]", "batch_ms"),
+        ("batch, in process, once compiled [ms]", "batch_once_compiled_ms"),
+        ("batch, two workers [ms]", "two_workers_ms"),
         ("loop, theta alone, of all processors [ms]", "loop_theta_processor_ms"),
         ("loop, with statistics, of all processors [ms]", "loop_statistics_processor_ms"),
         ("RollingOLS, of all processors [ms]", "rolling_ols_processor_ms"),
-        ("batch, of all processors [ms]", "batch_processor_ms"),
+        ("batch in process, of all processors [ms]", "batch_processor_ms"),
+        ("two workers over one, once compiled", "two_workers_over_one"),
         ("times faster than the faster of theta alone", "times_faster_than_theta_alone"),
         ("times faster than the loop with statistics", "times_faster_than_with_statistics"),
         ("of it reading, one thread [ms]", "read_ms"),
@@ -262,8 +266,8 @@ def write(results: dict[str, Any]) -> None:
         "", "| | one row of ten | every sample |", "|---|---|---|",
         *(f"| {title} | {rounded[columns[0]][key]:g} | {rounded[columns[1]][key]:g} |" for title, key in rows),
         "",
-        f"Two workers over one: {rounded['two_workers_over_one']:g}. Peak memory at 200 and 2000 recordings: "
-        f"{rounded['peak_mb_200']:g} and {rounded['peak_mb_2000']:g} MB. Programs compiled for 1000 lengths: "
+        f"Peak memory of a tenth of the recordings and of all: {rounded['peak_mb_tenth']:g} and "
+        f"{rounded['peak_mb_all']:g} MB. Programs compiled for 1000 lengths: "
         f"{rounded['compilations_1000_lengths']}. Load of the machine before and after: {rounded['load_before']:g}, "
         f"{rounded['load_after']:g}: above the number of cores, others took their share of all times.",
     ]  # fmt: skip
@@ -277,4 +281,4 @@ if __name__ == "__main__":
         one_run(where, read_job(job_file), to)
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
     else:
-        main(int(sys.argv[1]) if len(sys.argv) > 1 else 500)
+        main(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)
