@@ -909,6 +909,15 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: 
     assert json.loads((tmp_path / "out/quarantine.json").read_text()) == []
 
 
+def test_somebodys_cluster_gives_the_same(study: Path, tmp_path: Path) -> None:
+    """Workers that know nothing of us, but for where we are installed."""
+    distributed = pytest.importorskip("distributed")
+    options = {"host": "127.0.0.1", "dashboard_address": None, "worker_dashboard_address": None, "silence_logs": 50}
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, **options) as cluster:
+        assert run(study, tmp_path / "out", scheduler=cluster.scheduler_address).exit_status == 0
+    assert content(tmp_path / "out") == content(study / "reference")
+
+
 def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="one of the two"):
         run(study, tmp_path / "a", workers=2, scheduler="tcp://127.0.0.1:1")
