@@ -33,6 +33,7 @@ from jaximp.models import PlanarArm
 from jaximp.noise import (
     Noise,
     attenuation,
+    corrected,
     disagreement,
     fit_autoregression,
     fit_noise,
@@ -156,6 +157,10 @@ def test_whiteness_is_that_of_statsmodels_and_knows_gaps() -> None:
     valid = random.uniform(size=400) > 0.2
     statistics = [whiteness(np.where(valid, x, np.nan), valid).statistic for x in random.normal(size=(300, 400))]
     assert kstest(statistics, chi2(20).cdf).pvalue > 1e-3
+    # Coefficients that were fitted to the residuals are taken off the degrees of freedom.
+    expected = statsmodels.acorr_ljungbox(e, lags=[25], model_df=6)
+    np.testing.assert_allclose(whiteness(e, lags=25, fitted=6).p, expected.lb_pvalue.iloc[0])
+    assert np.isnan(whiteness(e, lags=6, fitted=6).p)
 
 
 def test_autoregression_is_found_where_the_residuals_demand_it() -> None:
@@ -207,6 +212,19 @@ def test_noise_that_the_fit_followed_is_given_back() -> None:
     gap = np.mean(ideal) - np.mean(naive)
     assert gap > 0.08
     assert abs(np.mean(mended) - np.mean(ideal)) < 0.3 * gap
+
+
+def test_stretches_have_rows_enough_for_their_parameters() -> None:
+    """With fewer, their parameters would follow all noise, and nothing of it be left to be seen."""
+    random = np.random.default_rng(0)
+    W, e = random.normal(size=(2000, 8)), lfilter([1], [1, -0.7], random.normal(size=2000))
+    for stretch in (1, 4, 8, 24):
+        np.testing.assert_allclose(fit_noise(W, e, stretch=stretch).autoregression[0], [0.7], atol=0.06)
+    # Too few rows for two stretches are one.
+    whole = fit_noise(W[:47], e[:47]).autoregression
+    np.testing.assert_array_equal(fit_noise(W[:47], e[:47], stretch=1).autoregression, whole)
+    assert whole
+    assert not fit_noise(W[:5], e[:5]).autoregression  # fewer than parameters
 
 
 # Densities
@@ -601,6 +619,17 @@ def test_small_noise_in_the_regressor_is_left_alone_and_large_noise_refused() ->
     np.testing.assert_allclose(whitened_covariance(difference)[0], np.diag([1, 4, 9]), atol=0.5)
 
 
+def test_an_output_of_which_no_row_counts_says_nothing() -> None:
+    W, y = record(400)
+    sigma, valid = np.array([0.0, 0.2, 0.03]), np.tile([True, False], (400, 1))
+    rows = whiten(np.stack([W, W], axis=1), np.stack([y, y], axis=1), valid=valid)
+    given = corrected(rows, sigma)
+    np.testing.assert_array_equal(given[0], corrected(whiten(W, y), sigma)[0])
+    assert not given[1].any()
+    with pytest.raises(ValueError, match="independent rows cannot determine 3 parameters and the noise"):
+        linear_density(NAMES, UNITS, rows, column_noise=sigma)
+
+
 # Predictions
 
 
@@ -632,6 +661,19 @@ def test_bands_hold_their_share_of_the_torque() -> None:
     np.testing.assert_allclose(middle, W @ THETA, atol=0.1)
     two = torque_bands(np.c_[samples, samples[:, 3]], np.stack([W, W], axis=1), (0.1, 0.9), noise=False)
     np.testing.assert_allclose(two[0], np.stack([W @ THETA] * 2, axis=1), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("heavy_tails", "nu"), [(True, 4.0), (3.0, 3.0)])
+def test_bands_of_heavy_tails_reach_as_far_as_these(heavy_tails: bool | float, nu: float) -> None:
+    W, _ = record(2000)
+    y = W @ THETA + 0.3 * np.random.default_rng(1).standard_t(nu, 2000)
+    samples = np.tile([*THETA, np.log(0.3)], (400, 1))
+    low, high = torque_bands(samples, W, (0.025, 0.975), heavy_tails=heavy_tails)
+    assert abs(np.mean((y > low) & (y < high)) - 0.95) < 0.02
+    assert abs(np.median(high - low) / (0.6 * student.ppf(0.975, nu)) - 1) < 0.05
+    # Those of Gaussian noise of the same scale are too narrow.
+    low, high = torque_bands(samples, W, (0.025, 0.975))
+    assert np.mean((y > low) & (y < high)) < 0.92
 
 
 # Calibration
