@@ -9,13 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
+from scipy.stats import t as student
 from test_identify import JOB, TIME, TRUTH, joint
 
-from jaximp import cli
+from jaximp import cli, inference, posterior_report
+from jaximp.identify import prepare
 from jaximp.inference import Inference, compare_models, infer_recording, sentences
 from jaximp.job import parse_job
+from jaximp.models import HumanJoint, Joints, Model, ReflexPathway, RobotJoint
+from jaximp.posterior import Posterior, make_posterior, stacked
 from jaximp.posterior_files import load_posterior
-from jaximp.recordings import save_recording
+from jaximp.predictive import PriorPredictive
+from jaximp.recordings import recording_from_arrays, save_recording
 from jaximp.types import Recording
 
 
@@ -51,6 +58,18 @@ def test_torque_lies_within_its_band(found: Inference) -> None:
     assert 0.9 < found.inside < 0.99
     assert found.score is not None
     assert found.whiteness[0].p > 1e-3
+
+
+@pytest.mark.parametrize(("after", "share", "least"), [(1, 0.98, 1), (140, 0.9, 11)], ids=["slow", "echo"])
+def test_residuals_are_tested_over_more_lags_than_were_fitted(after: int, share: float, least: int) -> None:
+    """Torque noise that follows from itself so many samples before."""
+    recording, new = joint(), np.random.default_rng(5).normal(0, 0.1, len(TIME))
+    noise = lfilter([1], np.r_[1, np.zeros(after - 1), -share], new)[:, None]
+    found = infer_recording(parse_job(JOB), replace(recording, torque=recording.torque + noise))
+    fitted, test = len(found.noise.autoregression[0]), found.whiteness[0]
+    assert fitted >= least
+    assert test.lags == max(20, fitted + 10)
+    assert test.p == pytest.approx(chi2.sf(test.statistic, test.lags - fitted))
 
 
 def test_without_a_change_its_probability_is_near_one_half(found: Inference) -> None:
@@ -114,8 +133,33 @@ def test_windows_without_samples_are_left_out() -> None:
     position, torque = (np.where(valid[:, None], x, np.nan) for x in (recording.position, recording.torque))
     found = infer_recording(parse_job(JOB), replace(recording, position=position, torque=torque, valid=valid))
     assert found.why == ""
-    assert [line for line in found.left_out if line.startswith("3 s: 0 independent rows")]
+    assert [line for line in found.left_out if line.startswith("3 s: 0 independent rows cannot determine")]
     assert 3 not in found.start
+
+
+@pytest.mark.parametrize("measured", [TIME < 3.5, TIME > 4.5], ids=["first half", "second half"])
+def test_a_half_without_samples_has_no_score(measured: np.ndarray) -> None:
+    recording = joint()
+    position, torque = (np.where(measured[:, None], x, np.nan) for x in (recording.position, recording.torque))
+    half = replace(recording, position=position, torque=torque, valid=measured)
+    found = infer_recording(parse_job(JOB), half)
+    assert found.held_out is None
+    assert found.score is None
+    assert found.why == ""
+    with pytest.raises(ValueError, match="half of the record does not determine"):
+        compare_models(found, found)
+
+
+def test_an_output_of_which_no_sample_counts_leaves_the_score_to_others(found: Inference) -> None:
+    assert found.held_out is not None
+    both = replace(found, held_out=np.column_stack([found.held_out, np.full(len(found.held_out), np.nan)]))
+    assert both.score == found.score
+
+
+def test_torque_without_noise_is_refused_in_one_line() -> None:
+    recording = joint()
+    with pytest.raises(ValueError, match=r"^.*to the last digit: without noise there is nothing to be unsure of$"):
+        infer_recording(parse_job(JOB), replace(recording, torque=0 * recording.torque))
 
 
 def test_joints_side_by_side_with_heavy_tails() -> None:
@@ -136,6 +180,72 @@ def test_joints_side_by_side_with_heavy_tails() -> None:
         assert abs(found.whole[name].mean() - truth) < 4 * found.whole[name].std()
     assert found.bands.shape == (5, *found.torque.shape)
     assert found.torque.shape[1] == 2
+    # The bands have the tails of the noise, of each joint its own.
+    width = np.median(found.bands[-1] - found.bands[0], axis=0)
+    scale = [np.exp(found.whole[name]).mean() for name in ("log_noise_1", "log_noise_2")]
+    np.testing.assert_allclose(width, 2 * student.ppf(0.975, 4) * np.array(scale), rtol=0.1)
+
+
+def slow_sum(seed: int, away: float = 0.0) -> Posterior:
+    """Two weights that mix well, each by itself, and whose sum hardly moves at all."""
+    random = np.random.default_rng(seed)
+    fast, slow = random.normal(size=(8, 500)), np.repeat(random.normal(size=(8, 5)), 100, axis=1)
+    return make_posterior(
+        np.stack([fast + 0.01 * slow, away - fast + 0.01 * slow, random.normal(size=(8, 500))], axis=2),
+        ("reflex_040ms", "reflex_080ms", "log_noise"),
+    )
+
+
+def test_a_gain_with_few_draws_is_not_believed(found: Inference) -> None:
+    """Of a reflex the gain is shown, and it is the gain whose draws must suffice."""
+    assert found.windows is not None
+    whole, n = slow_sum(0), len(found.windows)
+    assert whole.ok
+    windows = stacked([slow_sum(k) for k in range(1, n + 1)])
+    assert windows.ok.all()
+    by_weight = replace(found, whole=whole, windows=windows, bias=np.zeros(2), shift=np.zeros(2))
+    assert by_weight.why == ""
+    assert by_weight.good.any()
+    by_gain = replace(by_weight, gains={"reflex_gain": np.ones(2)})
+    assert "reflex_gain" in by_gain.why
+    assert not by_gain.good.any()
+    assert all("reflex_gain" in by_gain.reason(k) for k in range(n))
+
+
+REFLEX = HumanJoint(reflex=ReflexPathway(100.0, [0.02, 0.075], -1))
+
+
+@pytest.mark.parametrize(
+    ("model", "names"),
+    [
+        (REFLEX, ["reflex_gain"]),
+        (RobotJoint() + REFLEX, ["human.reflex_gain"]),
+        (Joints(REFLEX, HumanJoint(), REFLEX), ["joint1.reflex_gain", "joint3.reflex_gain"]),
+    ],
+    ids=["alone", "pair", "joints"],
+)
+def test_gains_have_the_names_of_their_weights(model: Model, names: list[str]) -> None:
+    found = inference._gains(model)
+    assert list(found) == names
+    for name, gain in found.items():
+        weights = [name.replace("gain", lag) for lag in ("020ms", "075ms")]
+        assert [model.names[k] for k in np.flatnonzero(gain)] == weights
+        assert set(gain[gain != 0]) == {-1.0}
+
+
+@pytest.mark.parametrize("method", [3, 4])
+def test_a_robot_alone_that_was_recorded_for_less_long_judges_no_window_less(method: int) -> None:
+    """Methods 3 and 4 have no rows beyond its end, and the posterior does."""
+    held, robot = joint(), "human = true\nrobot = { gravity = false, coulomb = false }"
+    noise = np.random.default_rng(4).normal(0, 0.05, len(TIME) // 2)
+    q = held.position[: len(noise), 0]
+    velocity = np.gradient(q, TIME[: len(noise)])
+    alone = recording_from_arrays(TIME[: len(noise)], q, 0.3 * velocity + noise)
+    text = JOB.replace("human = true", f"{robot}\nmethods = [{method}]") + "[robot_recording]\nfile = 'in the test'\n"
+    job = parse_job(text)
+    place, verdicts = inference._judged(job, prepare(job, held, alone))
+    assert len(place.starts) == len(verdicts.verdict) == 8
+    assert verdicts.trusted.sum() >= 6
 
 
 @pytest.mark.parametrize(
@@ -190,3 +300,30 @@ def test_the_command_writes_draws_and_a_report(
     assert "What is behind these draws cannot be trusted" in page
     assert "&lt;b&gt;.csv" in page
     assert "For a paper" not in page
+
+
+@pytest.mark.parametrize(
+    ("ratio", "flat", "said"),
+    [
+        ((0.01, 0.02, 0.05), ("log_noise",), True),
+        ((0.01, 0.02, 0.05), ("log_noise_1", "log_noise_2"), True),
+        ((0.01, 0.02, 0.05), ("stiffness", "log_noise"), False),  # which may make the rest of the torque
+        ((20.0, 30.0, 40.0), ("stiffness", "log_noise"), True),
+        ((0.05, 0.5, 20.0), ("log_noise",), False),
+    ],
+)
+def test_a_prior_contradicts_what_flat_parameters_do_not_make(
+    found: Inference, ratio: tuple[float, float, float], flat: tuple[str, ...], said: bool
+) -> None:
+    remarks = posterior_report._remarks(replace(found, prior=PriorPredictive(ratio, flat)), False)
+    assert any("they contradict each other" in line for line in remarks) == said
+
+
+def test_the_torque_is_shown_where_it_was_measured(found: Inference) -> None:
+    """The middle of what counts may lie in a gap that is longer than what is shown."""
+    torque = np.full_like(found.torque, np.nan)
+    n = len(torque)
+    torque[: n // 8] = torque[-(n // 8) :] = 1.0
+    figure = posterior_report._torque(replace(found, torque=torque), 0.5)
+    (panel,) = figure.axes
+    assert np.isfinite(panel.lines[-1].get_ydata()).any()
