@@ -31,6 +31,8 @@ NEGLIGIBLE = 1e-6
 """Share of the largest spectral density below which noise says nothing that can be believed."""
 RIDGE = 1e-8
 """Share of the largest spectral density that is added to all of it, so that the Cholesky factor exists."""
+ROUNDING = 1e-14
+"""Share of the largest spectral density with an autoregression below which all is rounding: the ridge is not less."""
 LARGEST_BAND = 200_000_000
 """Numbers that a band matrix may have (1.6 GB)."""
 FEWEST = 3
@@ -85,7 +87,10 @@ class Noise:
         if not self.autoregression or not len(self.autoregression[k]):
             return r, ridge
         whole = _with_autoregression(r, self.autoregression[k])
-        return whole[: np.flatnonzero(np.abs(whole) > 1e-10 * whole[0])[-1] + 1] / whole[0], ridge / whole[0]
+        # What is cut off changes the density by less than the ridge, or the covariance would not be positive definite.
+        beyond = 2 * np.cumsum(np.abs(whole[::-1]))[::-1]
+        ridge = max(ridge, ROUNDING * float(beyond[0]))
+        return whole[: np.count_nonzero(beyond > 0.1 * ridge)] / whole[0], ridge / whole[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.optimize import minimize
-from scipy.signal import lfilter
+from scipy.signal import fftconvolve, lfilter
 from scipy.stats import chi2, kstest, lognorm, multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student
 
@@ -182,6 +182,23 @@ def test_rows_with_an_autoregression_are_those_of_the_dense_covariance() -> None
     expected = solve_triangular(np.linalg.cholesky(toeplitz(r)), W, lower=True)
     np.testing.assert_allclose(rows.W[:, 0], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(rows.count, 50, rtol=1e-6)
+
+
+@pytest.mark.parametrize("poles", [[0.9, 0.9], [0.999]])
+def test_slow_noise_in_filters_that_keep_much_of_it_can_be_whitened(poles: list[float]) -> None:
+    """Its largest variance is so far above the least that little may be cut off from either."""
+    n, r = 400, signals.autocovariance(signals.butterworth(4, 40.0, 500.0), 2)
+    polynomial = np.poly(poles)
+    answer = lfilter([1], polynomial, np.r_[1, np.zeros(20_000)])
+    whole = fftconvolve(fftconvolve(answer, answer[::-1]), np.r_[r[:0:-1], r])
+    lags = whole[len(whole) // 2 :][:n]
+    ridge = 1e-8 * np.abs(np.fft.fft(np.r_[r, np.zeros(4000), r[:0:-1]])).max()
+    C = toeplitz(lags) + ridge * np.eye(n)
+    columns = np.random.default_rng(0).normal(size=(n, 2))
+    W, y = (np.linalg.cholesky(C / lags[0]) @ columns).T
+    rows = whiten(W[:, None], y, Noise(r, (-polynomial[1:],)))
+    np.testing.assert_allclose(rows.count, (1 - ridge / np.linalg.eigvalsh(C)).sum(), rtol=0.02)
+    np.testing.assert_allclose(np.column_stack([rows.W[:, 0], rows.y]), columns, atol=0.05)
 
 
 def test_noise_of_a_record_is_fitted_output_by_output() -> None:
