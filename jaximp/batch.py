@@ -7,11 +7,11 @@ nobody disturbed.
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import re
 import shutil
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -135,13 +135,13 @@ def run_plan(
     chosen = _checked_reports(reports, plan)
     _prepare_folder(out, resume, plan.items)
     task, outcome = Task.of(job, plan, out, chosen), Outcome(recordings=len(plan.items))
-    with _log(out, tell) as log:
+    with _log(out, tell) as log, _signals_heard() as check:
         log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
         left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
         done = outcome.skipped
         begin = time.perf_counter()
         try:
-            for batch, found in _solved(task, left, workers, scheduler):
+            for batch, found in _solved(task, left, workers, scheduler, check):
                 if isinstance(found, BaseException):
                     why = f"{type(found).__name__}: {' '.join(str(found).split())}"
                     outcome.broken.append(f"batch {batch.number}: {why}")
@@ -158,6 +158,7 @@ def run_plan(
                     {"event": "batch", "batch": batch.number, "done": done, "of": len(plan.items),
                      "failed": len(outcome.failed), "per_second": rate}
                 )  # fmt: skip
+            check()
         except (KeyboardInterrupt, SystemExit):
             log({"event": "interrupted", "done": done, "of": len(plan.items)})
             raise
@@ -266,41 +267,66 @@ def _log(out: Path, tell: Tell) -> Iterator[Tell]:
             file.close()
 
 
+@contextmanager
+def _signals_heard() -> Iterator[Callable[[], None]]:
+    """A function that raises once more what a signal raised: while garbage is collected, Python drops exceptions."""
+    heard: list[int] = []
+    handlers: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def hear(number: int, frame: Any) -> None:
+        heard.append(number)
+        handlers[number](number, frame)
+
+    def check() -> None:
+        if heard:
+            handlers[heard[0]](heard[0], None)
+
+    ours = [number for number, handler in handlers.items() if callable(handler) and not isinstance(handler, int)]
+    if threading.current_thread() is not threading.main_thread():
+        ours = []
+    for number in ours:
+        signal.signal(number, hear)
+    try:
+        yield check
+    finally:
+        for number in ours:
+            signal.signal(number, handlers[number])
+
+
 # --- who solves -------------------------------------------------------------------------------------------------------
 
 Found = Iterator[tuple[Batch, dict[str, Any] | BaseException]]
 
 
-def _solved(task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None) -> Found:
+def _solved(
+    task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None, check: Callable[[], None]
+) -> Found:
     """Every batch with its receipt, or with why there is none, in the order in which they are done."""
     if scheduler is not None or workers > 0:
-        return _on_workers(task, batches, workers, scheduler)
-    return _on_threads(task, batches)
+        return _on_workers(task, batches, workers, scheduler, check)
+    return _on_threads(task, batches, check)
 
 
-def _on_threads(task: Task, batches: Sequence[Batch]) -> Found:
+def _on_threads(task: Task, batches: Sequence[Batch], check: Callable[[], None]) -> Found:
     """In this process: while one batch is solved, others are read and written."""
     stop = threading.Event()
     pool = ThreadPoolExecutor(cores())
-    gc.collect()
-    gc.freeze()  # what is loaded by now need not be searched for garbage again and again
 
     def solve(batch: Batch) -> dict[str, Any]:
         return solve_batch(task, batch, stop.is_set)
 
+    def first_done(futures: list[Future[Any]]) -> list[Future[Any]]:
+        done: set[Future[Any]] = set()
+        while not done:  # a wait without end could not be interrupted by a signal on every system
+            done = wait(futures, timeout=1.0, return_when=FIRST_COMPLETED).done
+            check()
+        return [future for future in futures if future in done]
+
     try:
-        yield from _in_turn(batches, cores() + 1, lambda batch: pool.submit(solve, batch), _first_done)
+        yield from _in_turn(batches, cores() + 1, lambda batch: pool.submit(solve, batch), first_done)
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
-        gc.unfreeze()
-
-
-def _first_done(futures: list[Future[Any]]) -> list[Future[Any]]:
-    # A wait without end could not be interrupted by a signal on every system.
-    while not (done := wait(futures, timeout=1.0, return_when=FIRST_COMPLETED).done):
-        pass
-    return [future for future in futures if future in done]
 
 
 def _in_turn(
@@ -324,7 +350,9 @@ def _in_turn(
             yield batch, found
 
 
-def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None) -> Found:
+def _on_workers(
+    task: Task, batches: Sequence[Batch], workers: int, scheduler: str | None, check: Callable[[], None]
+) -> Found:
     """On the workers of a Dask cluster; a local one listens on the loopback interface alone."""
     try:
         from distributed import Client, LocalCluster
@@ -345,6 +373,7 @@ def _on_workers(task: Task, batches: Sequence[Batch], workers: int, scheduler: s
 
             def first_done(futures: list[Any]) -> list[Any]:
                 done = wait_for(futures, return_when="FIRST_COMPLETED").done
+                check()
                 return [future for future in futures if future in done]
 
             at_once = IN_FLIGHT * (workers or max(1, len(client.scheduler_info(n_workers=-1)["workers"])))

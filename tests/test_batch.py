@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import os
 import shutil
@@ -428,6 +429,27 @@ def interrupt(fault: Fault, out: Path) -> None:
     assert not list(out.rglob(f"*{batch_results.UNFINISHED}"))
 
 
+def interrupt_while_garbage_is_collected(fault: Fault, out: Path) -> None:
+    """Python drops what a signal raises in a callback of its collector: JAX has one."""
+
+    def lose(phase: str, about: dict[str, int]) -> None:
+        gc.callbacks.remove(lose)
+        signal.raise_signal(signal.SIGINT)
+        for _ in range(10_000):  # a signal is heard between two instructions
+            pass
+
+    def collect(event: dict[str, object]) -> None:
+        if event["event"] == "batch" and not lost:
+            lost.append(event)
+            gc.callbacks.append(lose)
+            gc.collect()
+
+    lost: list[object] = []
+    with pytest.raises(KeyboardInterrupt):
+        run(fault.study, out, tell=collect)
+    assert lost
+
+
 def out_of_memory(fault: Fault, out: Path) -> None:
     """A batch does not get its memory."""
     original = batch_results.solve_stack
@@ -512,11 +534,13 @@ def killed_process(fault: Fault, out: Path) -> None:
 
 
 FAULTS = [
-    full_disk, interrupt, out_of_memory, no_memory_to_read, vanished_file, too_many_files, damaged_result,
-    damaged_receipt, killed_process,
+    full_disk, interrupt, interrupt_while_garbage_is_collected, out_of_memory, no_memory_to_read, vanished_file,
+    too_many_files, damaged_result, damaged_receipt, killed_process,
 ]  # fmt: skip
 
 
+# The signal's exception that Python drops is what the test is about.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_nothing_is_lost_and_nothing_differs(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[Fault, Path], None]
