@@ -9,6 +9,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,10 @@ class RobotSettings:
     inertia: bool = True
     offset: bool = False
     g: float = 9.81
+
+    def make(self, sample_rate: float | None = None, joint: str = "revolute") -> RobotJoint:
+        """The model; it does not depend on the sample rate."""
+        return RobotJoint(**vars(self), joint=joint)
 
 
 @dataclass(frozen=True)
@@ -235,13 +240,18 @@ class Job:
                     "the position and two of the torque"
                 )
             return self.model.arm.make(), None
-        robots = None if robot is None else [RobotJoint(**vars(robot), joint=joint) for joint in joints]
-        humans = None if human is None else [human.make(sample_rate, joint) for joint in joints]
-        one_or_joints = [
-            None if models is None else models[0] if len(models) == 1 else Joints(*models)
-            for models in (robots, humans)
-        ]
-        return one_or_joints[0], one_or_joints[1]
+        return _side_by_side(robot, joints, sample_rate), _side_by_side(human, joints, sample_rate)
+
+
+@lru_cache(maxsize=64)
+def _side_by_side(
+    one: RobotSettings | HumanSettings | None, joints: tuple[str, ...], sample_rate: float | None
+) -> Model | None:
+    """The model of one joint or several, if there is one; thousands of recordings share it."""
+    if one is None:
+        return None
+    models = [one.make(sample_rate, joint) for joint in joints]
+    return models[0] if len(models) == 1 else Joints(*models)
 
 
 def read_job(path: str | Path) -> Job:

@@ -20,6 +20,8 @@ MOST_COLUMNS = 1000
 """A variable with more in both directions is no recording."""
 MOST_NUMBERS = 1_000_000_000
 """A struct that holds more is not unpacked to count them."""
+THREADS_PAY = 200_000
+"""Rows of a Parquet file from which its columns are read at the same time: to hand over small ones takes longer."""
 COMPRESSED = 15
 """How a MATLAB v5 file marks what it compressed."""
 
@@ -161,7 +163,7 @@ def _read_csv(path: Path, names: list[str]) -> dict[str, Any]:
         header = next((line for line in file if line.strip("\r\n")), "").strip("\r\n")
     if not header:
         raise RecordingError("is empty; the first line must name the columns")
-    delimiter = max(",;\t", key=header.count)
+    delimiter = delimiter_of(header)
     raw = next(csv.reader([header], delimiter=delimiter))
     spelled = {column.strip(): column for column in raw}
     for name in names:
@@ -179,6 +181,11 @@ def _read_csv(path: Path, names: list[str]) -> dict[str, Any]:
         _blame_csv_row(path, delimiter, {name: raw.index(spelled[name]) for name in names}, len(raw))
         raise
     return {name: table[spelled[name]].to_numpy() for name in names}
+
+
+def delimiter_of(header: str) -> str:
+    """What separates the columns that a header names: comma, semicolon or tab."""
+    return max(",;\t", key=header.count)
 
 
 def _blame_csv_row(path: Path, delimiter: str, wanted: dict[str, int], width: int) -> None:
@@ -223,7 +230,7 @@ def _read_parquet(path: Path, names: list[str]) -> dict[str, Any]:
                 pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind) or pyarrow.types.is_decimal(kind)
             ):
                 raise RecordingError(f"column {name!r} holds {kind}, not numbers; store it as numbers in a known unit")
-        table = file.read(columns=names)
+        table = file.read(columns=names, use_threads=file.metadata.num_rows > THREADS_PAY)
     return {name: table[name].cast(pyarrow.float64(), safe=False).to_numpy() for name in names}
 
 

@@ -546,7 +546,7 @@ def quantisation_step(x: NDArray[np.float64]) -> float:
     """
     known = x[np.isfinite(x)]
     # If N samples take N / 2 values, about a hundred pairs among 10 sqrt(N) of them are equal: without any, no step.
-    some = np.unique(np.random.default_rng(0).integers(max(len(known), 1), size=int(10 * len(known) ** 0.5)))
+    some = _some(len(known))
     if len(_distinct(known[some])) == len(some):
         return 0.0
     values = _distinct(known)
@@ -556,6 +556,12 @@ def quantisation_step(x: NDArray[np.float64]) -> float:
     multiples = gaps / gaps.min()
     fits = np.abs(multiples - np.round(multiples)) < 0.05
     return float(np.median((gaps / np.round(multiples))[fits])) if fits.mean() > 0.9 else 0.0
+
+
+@lru_cache(maxsize=32)
+def _some(count: int) -> NDArray[np.int64]:
+    """About 10 sqrt(N) of so many indices, drawn once."""
+    return np.unique(np.random.default_rng(0).integers(max(count, 1), size=int(10 * count**0.5)))
 
 
 def _distinct(x: NDArray[np.float64]) -> NDArray[np.float64]:
