@@ -48,6 +48,7 @@ from jaximp.overview import Series, thinned, write_overview
 from jaximp.plots import main_parameter
 from jaximp.signals import require_float64
 from jaximp.trust import TRUSTED
+from jaximp.types import nearest
 
 Tell = Callable[[dict[str, Any]], None]
 """Called with what happens: `{"event": "batch", "done": 64, ...}`."""
@@ -80,6 +81,9 @@ class Outcome:
     """Recordings that an earlier run had done."""
     failed: list[dict[str, Any]] = field(default_factory=list)
     """Recordings in quarantine: `recording`, `file`, `reason`, `metadata`."""
+    doubted: int = 0
+    """Recordings without a trusted window, and what is said of the first of them."""
+    doubt: str = ""
     broken: list[str] = field(default_factory=list)
     """Batches that could not be finished, and why: `resume` does them again."""
 
@@ -181,10 +185,10 @@ def run_plan(
 def _checked_reports(reports: str | Sequence[str], plan: Plan) -> str | tuple[str, ...]:
     if isinstance(reports, str) and reports in ("all", "failed", "none"):
         return reports
-    names = (reports,) if isinstance(reports, str) else tuple(reports)
-    for name in names:
-        if name not in {item.name for item in plan.items}:
-            raise ValueError(f"there is no recording '{name}' to report: give all, failed, none or a recording's name")
+    names, known = (reports,) if isinstance(reports, str) else tuple(reports), [item.name for item in plan.items]
+    for name in set(names) - set(known):
+        hint = nearest(name, ["all", "failed", "none", *known])
+        raise ValueError(f"there is no recording '{name}' to report: give all, failed, none or a name; {hint}")
     return names
 
 
@@ -199,6 +203,8 @@ def _take_up(outcome: Outcome, receipt: dict[str, Any]) -> None:
     outcome.failed += receipt["failed"]
     outcome.windows += receipt["windows"]
     outcome.trusted += receipt["trusted"]
+    outcome.doubted += receipt["doubted"]
+    outcome.doubt = min(filter(None, (outcome.doubt, receipt["doubt"])), default="")
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------

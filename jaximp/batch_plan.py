@@ -25,7 +25,7 @@ import numpy as np
 
 from jaximp.job import Job
 from jaximp.outputs import MARK
-from jaximp.readers import FORMATS, RecordingError, count_samples
+from jaximp.readers import FORMATS, RecordingError, count_samples, delimiter_of
 from jaximp.stacks import stack_size, stackable
 
 MOST_SIZES = 4
@@ -40,6 +40,8 @@ PARTITIONS = ("subject", "session", "condition")
 """Columns of a manifest that partition the results, where nothing else is said."""
 MISSING = "missing"
 """An empty value in a folder's name: the name that Hive has for it not every reader can digest."""
+MOST_NAMED = 20
+"""Recordings that are refused and named one by one by the plan."""
 LOG = "batch.log"
 LONGEST_NAME = 120
 """Letters of a value in a folder's name, after encoding."""
@@ -101,8 +103,10 @@ class Plan:
     def in_words(self, job: Job) -> list[str]:
         """The plan, a line each."""
         items = self.items
-        refused = sum(bool(item.refused) for item in items)
-        lines = [f"{len(items)} recordings in {len(self.batches)} batches" + (f", {refused} refused" * bool(refused))]
+        refused = [item for item in items if item.refused]
+        lines = [f"{_counted(len(items), 'recording')} in {_counted(len(self.batches), 'batch', 'batches')}"]
+        lines += [f"refused: {item.name}: {item.refused}" for item in refused[:MOST_NAMED]]
+        lines += [f"refused: {len(refused) - MOST_NAMED} others"] if len(refused) > MOST_NAMED else []
         model = job.model
         which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
@@ -115,6 +119,10 @@ class Plan:
                 lines.append(f"{count} one by one" + (f": {self.one_by_one}" * bool(self.one_by_one)))
         lines.append(f"partitioned by {', '.join(self.partitions)}" if self.partitions else "not partitioned")
         return [*lines, f"results: about {_in_bytes(expected_bytes(job, items))}"]
+
+
+def _counted(count: int, one: str, several: str = "") -> str:
+    return f"{count} {one if count == 1 else several or one + 's'}"
 
 
 def expected_bytes(job: Job, items: Sequence[Item]) -> float:
@@ -229,7 +237,9 @@ def _manifest_rows(manifest: Path) -> list[dict[str, str]]:
     elif manifest.suffix.lower() == ".csv":
         try:
             with manifest.open(encoding="utf-8-sig", newline="") as text:
-                lines = csv.DictReader(text, strict=True)
+                delimiter = delimiter_of(text.readline())
+                text.seek(0)
+                lines = csv.DictReader(text, delimiter=delimiter, strict=True)
                 header = [name.strip() for name in lines.fieldnames or ()]
                 if len(set(header)) < len(header):
                     raise csv.Error("two columns have the same name")
@@ -261,7 +271,8 @@ def why_refused(path: Path) -> str:
     try:
         mode = path.lstat().st_mode
     except OSError as error:
-        return f"{error.strerror or error}: check the path"
+        slashes = "; write / between folders" if "\\" in str(path) and os.sep == "/" else ""
+        return f"{error.strerror or error}: check the path{slashes}"
     except ValueError:
         return "this is no path: name a recording"
     if stat.S_ISLNK(mode):

@@ -122,6 +122,11 @@ class Result:
     def status(self) -> str:
         return OK if self.estimates else FAILED
 
+    @property
+    def remark(self) -> str:
+        """Why it failed, or else why none of its windows can be trusted."""
+        return self.estimates[0].verdicts.complaint() if self.estimates else self.reason
+
 
 def checksum(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
@@ -170,12 +175,15 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
         raise Interrupted
     unwritten |= _write_reports(task, results)
     outputs = _write_tables(task, batch, results)
+    doubts = [f"{result.item.name}: {result.remark}" for result in results if result.estimates and result.remark]
     receipt = {
         "batch": batch.number,
         "key": key,
         "inputs": {result.item.name: result.sha256 for result in results},
         "outputs": outputs,
         "failed": [failure(result.item, result.reason) for result in results if result.status == FAILED],
+        "doubted": len(doubts),
+        "doubt": min(doubts, default=""),
         "windows": sum(len(result.estimates[0].start) for result in results if result.estimates),
         "trusted": sum(int(result.estimates[0].verdicts.trusted.sum()) for result in results if result.estimates),
         "run": {"seconds": time.perf_counter() - begin, "without_report": unwritten},
@@ -280,7 +288,8 @@ class _reasons:
         if isinstance(error, OSError | UnavailableError):
             self.result.sha256 = ""  # another run is to try again
         expected = isinstance(error, ValueError | OSError)
-        text = " ".join(str(error).split())
+        text = str(error).removeprefix(f"{self.result.item.file}: ")
+        text = " ".join(text.removeprefix(f"{os.path.abspath(self.result.item.file)}: ").split())
         self.result.reason = text if expected else f"{type(error).__name__}: {text}"
         self.result.estimates = []
         return True
@@ -433,7 +442,7 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     measured = [result.about for result in results]
     columns += [
         ("status", "", _texts(result.status for result in results)),
-        ("reason", "", _texts(result.reason for result in results)),
+        ("reason", "", _texts(result.remark for result in results)),
         ("samples", "1", np.array([0 if r is None else r.samples for r in measured])),
         ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in measured)),
         ("duration_s", "s", _numbers(r and r.duration for r in measured)),
@@ -472,8 +481,8 @@ def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.flo
             fit, trusted = result.estimates[0].summarised().fit, result.estimates[0].verdicts.trusted
             theta = np.asarray(fit.theta)[trusted]
             found["mean"][k], found["sd"][k] = theta.mean(axis=0), theta.std(axis=0)
-            found["median_stderr"][k] = np.median(np.asarray(fit.stderr)[trusted], axis=0)
-            dof[k] = np.median(np.asarray(fit.dof)[trusted])
+            errors = np.column_stack([fit.stderr, fit.dof])[trusted]
+            *found["median_stderr"][k], dof[k] = np.median(errors, axis=0)
     low, high = confidence_interval(0 * found["median_stderr"], found["median_stderr"], dof)
     found["half_width_95"] = (high - low) / 2
     return found

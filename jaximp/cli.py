@@ -265,17 +265,17 @@ def batch(
     them. What fails is listed in quarantine.json, and the rest goes on; the exit status is 3 then. A run that was
     broken off goes on with --resume, which also writes reports that are asked for later.
     """
+    from jaximp.batch import check_metadata, run_plan
     from jaximp.batch_plan import find_items, make_plan
     from jaximp.job import read_job
 
     job = read_job(job_file)
     plan = make_plan(job, find_items(files or [], manifest, allow_outside), partition)
     if dry_run:
+        check_metadata(job, plan)
         for line in plan.in_words(job):
             typer.echo(line)
         return
-    from jaximp.batch import run_plan
-
     chosen = reports[0] if reports and len(reports) == 1 else reports or "none"
     with _interruptible(), _events(len(plan.items), quiet, json_lines) as tell:
         outcome = run_plan(job, plan, out, workers, scheduler, resume, chosen, tell)
@@ -287,6 +287,8 @@ def batch(
     if not (quiet or json_lines):
         done = outcome.recordings - len(outcome.failed)
         typer.echo(f"{done} of {outcome.recordings} recordings, {outcome.trusted} of {outcome.windows} windows trusted")
+        if outcome.doubted:
+            typer.echo(f"{outcome.doubted} without a trusted window; {outcome.doubt}")
         typer.echo(f"results: {out.resolve()}\noverview: {out.resolve() / 'overview.html'}")
     if outcome.exit_status:
         raise typer.Exit(outcome.exit_status)
@@ -368,8 +370,9 @@ def _check_trials(job: Job) -> None:
 def _say_result(estimates: Estimates) -> None:
     counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
     typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
-    if not estimates.verdicts.trusted.any():
-        typer.echo("no window can be trusted, for example: " + next(filter(None, estimates.verdicts.reason)))
+    complaint = estimates.verdicts.complaint()
+    if complaint:
+        typer.echo(complaint)
         return
     typer.echo("mean and standard deviation over the trusted windows:")
     shown = estimates.summarised()

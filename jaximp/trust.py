@@ -287,6 +287,14 @@ class Verdicts:
         """How many windows got each verdict."""
         return {verdict: int((self.verdict == verdict).sum()) for verdict in VERDICTS}
 
+    def complaint(self) -> str:
+        """Where no window can be trusted, what is said of the first that has the most frequent verdict; else empty."""
+        if self.trusted.any() or not len(self.verdict):
+            return ""
+        counts = self.counts()
+        first = int(np.argmax(self.verdict == max(counts, key=lambda name: counts[name])))
+        return f"no window can be trusted, for example: {self.reason[first]}"
+
 
 def worst(several: Sequence[Verdicts], labels: Sequence[str]) -> Verdicts:
     """The worst verdict of several on the same windows, its reason behind a label."""
@@ -349,7 +357,10 @@ def judge(
         (
             ratio < limits.min_excitation_ratio,
             WEAK,
-            lambda k: f"{names[noisiest[k]]}: its column is {ratio[k]:.2g} times what position noise alone builds",
+            lambda k: (
+                f"{names[noisiest[k]]}: its column is {ratio[k]:.2g} times what position noise alone builds: "
+                "move more, or filter more (filter.position_cutoff)"
+            ),
         ),
         (
             dof < limits.min_dof,

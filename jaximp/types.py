@@ -70,11 +70,16 @@ class Recording:
         return len(self.time)
 
 
+MOST_CHOICES = 50
+"""That a hint names."""
+
+
 def nearest(name: str, choices: list[str]) -> str:
-    """A hint for error messages: the choice that `name` was probably meant to be, and all of them if none is near."""
+    """A hint for error messages: the choice that `name` was probably meant to be, and what there is if none is near."""
     import difflib
 
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.6)
     if close:
         return f"did you mean '{close[0]}'?"
-    return "there are: " + ", ".join(f"'{choice}'" for choice in choices)
+    shown = [f"'{choice}'" for choice in choices[:MOST_CHOICES]]
+    return "there are: " + ", ".join([*shown, *["..."] * (len(choices) > MOST_CHOICES)])

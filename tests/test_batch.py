@@ -296,7 +296,7 @@ def test_every_reader_reads_it(study: Path, reader: str) -> None:
         counts = windows.groupby("recording", observed=True).size().sort_index().tolist()
         subjects = set(windows["subject"].dropna())
     elif reader == "polars":
-        windows = library.read_parquet(str(out / "estimates/**/*.parquet"), hive_partitioning=True)
+        windows = library.read_parquet(out / "estimates")
         counts = windows.group_by("recording").len().sort("recording")["len"].to_list()
         subjects = set(windows["subject"].drop_nulls())
     else:
@@ -689,7 +689,7 @@ def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert events[-1]["failed"] == 5
     reasons = {one["recording"]: one["reason"] for one in json.loads((tmp_path / "batch/quarantine.json").read_text())}
     assert set(reasons) == {"bad.csv", "cut.parquet", "short.parquet", "link.parquet", "pipe.parquet"}
-    assert "not a number" in reasons["bad.csv"]
+    assert reasons["bad.csv"].startswith("column 'torque_Nm', row 1: 'x' is not a number")
     assert "symbolic links" in reasons["link.parquet"]
     assert "no plain file" in reasons["pipe.parquet"]
     table = batch.read_recordings(tmp_path / "batch")
@@ -709,6 +709,19 @@ def test_reports_are_those_that_were_asked_for(
     save_recording(recording_from_arrays(good.time, good.position, torque), tmp_path / "noise.parquet")
     assert batch.run(parse_job(JOB), [tmp_path], tmp_path / "out", reports=reports).exit_status == 0
     assert sorted(written) == expected
+
+
+def test_where_nothing_is_trusted_it_is_said_why(tmp_path: Path) -> None:
+    """At the end of a run, taken up or not, and beside the recording."""
+    save_recording(joint(1000), tmp_path / "moves.parquet")
+    save_recording(still(joint(1000, 1), slice(20, None)), tmp_path / "rests.parquet")
+    job, files = parse_job(JOB, tmp_path), [tmp_path / "moves.parquet", tmp_path / "rests.parquet"]
+    first, again = (batch.run(job, files, tmp_path / "out", resume=resume) for resume in (False, True))
+    reasons = batch.read_recordings(tmp_path / "out")["reason"].to_pylist()
+    assert reasons[0] == ""
+    assert reasons[1].startswith("no window can be trusted, for example: ")
+    for outcome in (first, again):
+        assert (outcome.doubted, outcome.doubt) == (1, f"rests.parquet: {reasons[1]}")
 
 
 def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -897,6 +910,18 @@ def test_a_job_with_trials_is_refused() -> None:
     job = replace(parse_job(JOB), trials="anything")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="trials"):
         make_plan(job, [])
+
+
+def test_manifests_are_what_spreadsheets_write(tmp_path: Path) -> None:
+    """With a mark at the beginning and semicolons, too; a path from Windows is told what is wrong with it."""
+    save_recording(joint(1000), tmp_path / "a b.parquet")
+    (tmp_path / "study.csv").write_text("file;subject\na b.parquet;1\n.\\a b.parquet;2\n", encoding="utf-8-sig")
+    plan = make_plan(parse_job(JOB), find_items([], tmp_path / "study.csv"))
+    assert [item.metadata for item in plan.items] == [(("subject", "1"),), (("subject", "2"),)]
+    assert plan.in_words(parse_job(JOB))[:2] == [
+        "2 recordings in 2 batches",
+        "refused: .\\a b.parquet: No such file or directory: check the path; write / between folders",
+    ]
 
 
 def test_a_folder_that_is_there_is_not_touched(study: Path, tmp_path: Path) -> None:
