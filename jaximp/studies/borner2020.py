@@ -180,7 +180,7 @@ def _criteria(
 
 
 def run(
-    case: Case, methods: Iterable[str], simulations: int = SIMULATIONS, impedance: bool = False, seed: int = SEED
+    case: Case, methods: Iterable[str], simulations: int, impedance: bool = False, seed: int = SEED
 ) -> dict[str, list[Errors]]:
     """Errors of each method in every simulation of one configuration."""
     arm, keys = NeuromuscularArm(), jax.random.split(jax.random.key(seed), simulations)
@@ -264,7 +264,7 @@ def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
     """Write the figures, tables.json and tables.md into an existing folder."""
     original: dict[str, list[Errors]] = {name: [] for name in METHODS}
     for k in range(SEEDS):
-        for name, errors in run(Case(), METHODS, impedance=True, seed=SEED + k).items():
+        for name, errors in run(Case(), METHODS, SIMULATIONS, True, SEED + k).items():
             original[name] += errors
         progress(0.2 * (k + 1) / SEEDS)
     swept: dict[str, dict[float, dict[str, list[Errors]]]] = {}
@@ -274,9 +274,9 @@ def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
             if case == Case():
                 swept[name][value] = {m: original[m][:SIMULATIONS] for m in COMPARED}
             elif value in PAPER[name]["FJI"]:
-                swept[name][value] = run(case, COMPARED, impedance=True)
+                swept[name][value] = run(case, COMPARED, SIMULATIONS, True)
             else:  # between what is tabulated, for the figure
-                swept[name][value] = run(case, COMPARED[:2])
+                swept[name][value] = run(case, COMPARED[:2], SIMULATIONS)
             progress(0.2 + 0.5 * (k + (i + 1) / len(cases)) / len(CASES))
     builds = compare_builds(progress=lambda share: progress(0.7 + 0.25 * share))
     tables = _tables(original, swept, builds)
