@@ -32,9 +32,12 @@ from jaximp.batch_results import (
     UNFINISHED,
     Interrupted,
     Task,
+    earlier_inputs,
     finished,
+    load,
     receipt_path,
     report_folder,
+    report_holds,
     report_wanted,
     reserved_columns,
     solve_batch,
@@ -42,6 +45,7 @@ from jaximp.batch_results import (
     write_whole,
 )
 from jaximp.chunks import cores
+from jaximp.identify import checked_models
 from jaximp.job import Job
 from jaximp.outputs import MARK
 from jaximp.overview import Series, thinned, write_overview
@@ -79,6 +83,10 @@ class Outcome:
     trusted: int = 0
     skipped: int = 0
     """Recordings that an earlier run had done."""
+    outdated: int = 0
+    """Reports of an earlier run that were removed: the recording, or the job, is another one now."""
+    dropped: int = 0
+    """Recordings of an earlier run that this one does not have; their results were removed."""
     failed: list[dict[str, Any]] = field(default_factory=list)
     """Recordings in quarantine: `recording`, `file`, `reason`, `metadata`."""
     doubted: int = 0
@@ -187,7 +195,9 @@ def _checked_reports(reports: str | Sequence[str], plan: Plan) -> str | tuple[st
         return reports
     names, known = (reports,) if isinstance(reports, str) else tuple(reports), [item.name for item in plan.items]
     for name in set(names) - set(known):
-        hint = nearest(name, ["all", "failed", "none", *known])
+        if name in ("all", "failed", "none"):
+            raise ValueError(f"reports: '{name}' stands alone: give it, or names of recordings")
+        hint = nearest(name, known)
         raise ValueError(f"there is no recording '{name}' to report: give all, failed, none or a name; {hint}")
     return names
 
@@ -197,6 +207,17 @@ def check_metadata(job: Job, plan: Plan) -> None:
     for name in plan.metadata:
         if name in reserved_columns(job):
             raise ValueError(f"the manifest's column '{name}' has the name of a result: rename it")
+
+
+def first_trouble(job: Job, plan: Plan) -> str:
+    """What the first recording that is to be read would fail by, if so: mostly all others would as well."""
+    item = next((item for item in plan.items if not item.refused), None)
+    if item is not None:
+        try:
+            checked_models(job, load(job.recording, item.file, job.folder))
+        except (ValueError, OSError) as error:
+            return f"{item.name} would fail: {error}"
+    return ""
 
 
 def _take_up(outcome: Outcome, receipt: dict[str, Any]) -> None:
@@ -228,12 +249,17 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
     """Leave nothing but what complete batches wrote; which batches are to be done."""
     with ThreadPoolExecutor(cores()) as pool:
         receipts = list(pool.map(lambda batch: finished(task, batch), plan.batches))
+    earlier = earlier_inputs(task.out)
+    outcome.dropped = len(set(earlier) - {item.name for item in plan.items})
     kept, left = set[Path](), []
     for batch, receipt in zip(plan.batches, receipts, strict=True):
         if receipt is None:
             left.append(batch)
-            for item in batch.items:  # what was reported may be of another content
-                shutil.rmtree(report_folder(task.out, item.name), ignore_errors=True)
+            for item in batch.items:
+                folder = report_folder(task.out, item.name)
+                if folder.is_dir() and not report_holds(task, item, earlier):
+                    outcome.outdated += 1
+                    shutil.rmtree(folder, ignore_errors=True)
             continue
         kept |= {receipt_path(task.out, batch), *(task.out / name for name in receipt["outputs"])}
         _take_up(outcome, receipt)
@@ -251,7 +277,10 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
         path.unlink()
     for draft in (task.out / "reports").glob(".*"):
         shutil.rmtree(draft, ignore_errors=True)
-    log({"event": "resume", "skipped": outcome.skipped, "left": sum(len(batch.items) for batch in left)})
+    log(
+        {"event": "resume", "skipped": outcome.skipped, "left": sum(len(batch.items) for batch in left),
+         "dropped": outcome.dropped, "reports_removed": outcome.outdated}
+    )  # fmt: skip
     return left
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from jaximp.job import Job
 from jaximp.outputs import MARK
 from jaximp.readers import FORMATS, RecordingError, count_samples, delimiter_of
+from jaximp.regression import step_seconds
 from jaximp.stacks import stack_size, stackable
 
 MOST_SIZES = 4
@@ -39,7 +40,9 @@ FILES_IN_BATCH = 16
 PARTITIONS = ("subject", "session", "condition")
 """Columns of a manifest that partition the results, where nothing else is said."""
 MISSING = "missing"
-"""An empty value in a folder's name: the name that Hive has for it not every reader can digest."""
+"""An empty value in a folder's name."""
+KNOWN = ("file", "robot_file", *PARTITIONS)
+"""Columns of a manifest that mean something, in whatever case they are written."""
 MOST_NAMED = 20
 """Recordings that are refused and named one by one by the plan."""
 LOG = "batch.log"
@@ -63,9 +66,12 @@ class Item:
     """Why it will not be read."""
 
     def partition(self, columns: Sequence[str]) -> str:
-        """Its folder below the results, such as `subject=S01`."""
+        """Its folder below the results, such as `subject-001`.
+
+        The values themselves stand in the files: from `subject=001` every reader would make a number of its own.
+        """
         values = dict(self.metadata)
-        return "/".join(f"{column}={_encoded(values.get(column, ''))}" for column in columns)
+        return "/".join(f"{column}-{_encoded(values.get(column, ''))}" for column in columns)
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,8 @@ class Plan:
         model = job.model
         which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
-        lines.append(f"model: {' and '.join(which)}{methods}; windows of {job.window.length:g} s")
+        windows = f"windows of {job.window.length:g} s every {step_seconds(job):g} s"
+        lines.append(f"model: {' and '.join(which)}{methods}; {windows}")
         counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
         for (size, stacked), count in sorted(counts.items()):
             if size:
@@ -118,20 +125,21 @@ class Plan:
             else:
                 lines.append(f"{count} one by one" + (f": {self.one_by_one}" * bool(self.one_by_one)))
         lines.append(f"partitioned by {', '.join(self.partitions)}" if self.partitions else "not partitioned")
-        return [*lines, f"results: about {_in_bytes(expected_bytes(job, items))}"]
+        return [*lines, f"results: about {_in_bytes(expected_bytes(job, self))}"]
 
 
 def _counted(count: int, one: str, several: str = "") -> str:
     return f"{count} {one if count == 1 else several or one + 's'}"
 
 
-def expected_bytes(job: Job, items: Sequence[Item]) -> float:
-    """Size of the results; windows are counted at the rate that the job states, or at 1 kHz."""
+def expected_bytes(job: Job, plan: Plan) -> float:
+    """Size of the results, as it was measured; windows are counted at the rate that the job states, or at 1 kHz."""
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
-    step = job.window.step or job.window.length / 50
-    windows = sum(max(0, (item.samples / rate - job.window.length) / step + 1) for item in items)
-    return 150.0 * windows + 2000.0 * len(items)
+    length, step = job.window.length, step_seconds(job)
+    windows = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items)
+    files = sum(len({item.partition(plan.partitions) for item in batch.items}) for batch in plan.batches)
+    return 120.0 * windows + 16_000.0 * files + 30_000.0 * len(plan.batches) + 2000.0 * len(plan.items)
 
 
 def _in_bytes(size: float) -> str:
@@ -208,10 +216,9 @@ def _from_manifest(manifest: Path, allow_outside: bool) -> list[Item]:
     rows = _manifest_rows(manifest)
     folder = Path(os.path.abspath(manifest)).parent
     items = []
-    for number, row in enumerate(rows, start=1):
-        where = f"{manifest}, row {number}"
+    for where, row in rows.items():
         if not row.get("file"):
-            raise ValueError(f"{where}: the column 'file' is empty; name a recording")
+            raise ValueError(f"{where}: the column 'file' is empty; name a recording, or delete the row")
         file, robot = (
             None if not row.get(column) else _inside(folder, row[column], where, allow_outside)
             for column in ("file", "robot_file")
@@ -222,8 +229,8 @@ def _from_manifest(manifest: Path, allow_outside: bool) -> list[Item]:
     return items
 
 
-def _manifest_rows(manifest: Path) -> list[dict[str, str]]:
-    """Rows as text, whatever their kind: results are partitioned by it."""
+def _manifest_rows(manifest: Path) -> dict[str, dict[str, str]]:
+    """Rows as text, whatever their kind, by where they stand; a spreadsheet's empty rows are left out."""
     if not manifest.is_file():
         raise ValueError(f"{manifest}: there is no such manifest; check the path")
     if manifest.suffix.lower() == ".parquet":
@@ -231,30 +238,52 @@ def _manifest_rows(manifest: Path) -> list[dict[str, str]]:
 
         try:
             with manifest.open("rb") as opened:
-                rows: list[Mapping[str, Any]] = parquet.read_table(opened).to_pylist()
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{manifest}: this is not a Parquet file: {error}") from None
+                table = parquet.read_table(opened)
+            table = table.rename_columns(_header(table.column_names))
+            found = {f"row {k}": row for k, row in enumerate(table.to_pylist(), start=1)}
+        except (ValueError, OSError, csv.Error) as error:
+            raise ValueError(f"{manifest}: this is not a Parquet file of a manifest: {error}") from None
     elif manifest.suffix.lower() == ".csv":
-        try:
-            with manifest.open(encoding="utf-8-sig", newline="") as text:
-                delimiter = delimiter_of(text.readline())
-                text.seek(0)
-                lines = csv.DictReader(text, delimiter=delimiter, strict=True)
-                header = [name.strip() for name in lines.fieldnames or ()]
-                if len(set(header)) < len(header):
-                    raise csv.Error("two columns have the same name")
-                lines.fieldnames = header
-                rows = list(lines)
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{manifest}: this is not a CSV file in UTF-8: {error}") from None
+        found = _csv_rows(manifest)
     else:
-        raise ValueError(f"{manifest}: a manifest is a .csv or a .parquet file")
-    if not rows or "file" not in rows[0]:
-        raise ValueError(f"{manifest}: a manifest has a column 'file' and a row for every recording; add them")
-    if any(None in row or None in row.values() for row in rows) and manifest.suffix.lower() == ".csv":
-        raise ValueError(f"{manifest}: a row has more or fewer fields than the header; repair it")
+        raise ValueError(f"{manifest}: a manifest is a .csv or a .parquet file: export it as one")
     # NaN is what pandas writes where there is nothing.
-    return [{key: "" if value is None or value != value else str(value) for key, value in row.items()} for row in rows]
+    texts = {
+        where: {key: "" if value is None or value != value else str(value) for key, value in row.items()}
+        for where, row in found.items()
+    }
+    rows = {f"{manifest}, {where}": row for where, row in texts.items() if any(row.values())}
+    first = next(iter(rows.values()), {})
+    if "file" not in first:
+        there = f"its columns are {', '.join(first)}: rename that of the recordings" if first else "it has no rows"
+        raise ValueError(f"{manifest}: a manifest has a column 'file' and a row for every recording, but {there}")
+    return rows
+
+
+def _csv_rows(manifest: Path) -> dict[str, dict[str, str]]:
+    """By the line in which they end; the header is the first line."""
+    try:
+        with manifest.open(encoding="utf-8-sig", newline="") as text:
+            delimiter = delimiter_of(text.readline())
+            text.seek(0)
+            lines = csv.DictReader(text, delimiter=delimiter, strict=True)
+            lines.fieldnames = _header(lines.fieldnames or ())
+            rows = {f"line {lines.line_num}": row for row in lines}
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{manifest}: this is not a CSV file in UTF-8: {error}; save it as one") from None
+    for where, row in rows.items():
+        if None in row or None in row.values():
+            raise ValueError(f"{manifest}, {where}: it has more or fewer fields than the header; repair it")
+    return rows
+
+
+def _header(names: Sequence[str]) -> list[str]:
+    """`Subject` is `subject`: in the wrong case it would not count people."""
+    stripped = [name.strip() for name in names]
+    header = [name.lower() if name.lower() in KNOWN else name for name in stripped]
+    if len(set(header)) < len(header):
+        raise csv.Error("two columns have the same name")
+    return header
 
 
 def _inside(folder: Path, name: str, where: str, allow_outside: bool) -> Path:
@@ -271,8 +300,10 @@ def why_refused(path: Path) -> str:
     try:
         mode = path.lstat().st_mode
     except OSError as error:
-        slashes = "; write / between folders" if "\\" in str(path) and os.sep == "/" else ""
-        return f"{error.strerror or error}: check the path{slashes}"
+        if isinstance(error, FileNotFoundError):
+            windows = "; it looks like one of Windows: write / between folders" if "\\" in str(path) else ""
+            return f"there is no file {path}: check the path (a manifest's begin at its own folder){windows}"
+        return f"{error.strerror or error}: check the path"
     except ValueError:
         return "this is no path: name a recording"
     if stat.S_ISLNK(mode):

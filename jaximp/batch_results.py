@@ -179,6 +179,7 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
     receipt = {
         "batch": batch.number,
         "key": key,
+        "job": job_checksum(task.job),
         "inputs": {result.item.name: result.sha256 for result in results},
         "outputs": outputs,
         "failed": [failure(result.item, result.reason) for result in results if result.status == FAILED],
@@ -208,7 +209,7 @@ def finished(task: Task, batch: Batch) -> dict[str, Any] | None:
         receipt: dict[str, Any] = json.loads(receipt_path(task.out, batch).read_text(encoding="utf-8"))
         if receipt["key"] != task.key(batch):
             return None
-        if any(receipt["inputs"][item.name] != _input_checksum(item) for item in batch.items):
+        if any(receipt["inputs"][item.name] != input_checksum(item) for item in batch.items):
             return None
         if any(file_checksum(task.out / name) != found for name, found in receipt["outputs"].items()):
             return None
@@ -217,7 +218,22 @@ def finished(task: Task, batch: Batch) -> dict[str, Any] | None:
     return receipt
 
 
-def _input_checksum(item: Item) -> str:
+def earlier_inputs(out: Path) -> dict[str, tuple[str, str]]:
+    """Of every recording that has results: the checksums of the job and of the input that they were made from."""
+    found: dict[str, tuple[str, str]] = {}
+    for path in (out / "receipts").glob("batch-*.json"):
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            receipt = json.loads(path.read_text(encoding="utf-8"))
+            found |= {name: (receipt["job"], sha256) for name, sha256 in receipt["inputs"].items()}
+    return found
+
+
+def report_holds(task: Task, item: Item, earlier: Mapping[str, tuple[str, str]]) -> bool:
+    """Whether the report of an earlier run is still that of this recording."""
+    return earlier.get(item.name) == (job_checksum(task.job), input_checksum(item))
+
+
+def input_checksum(item: Item) -> str:
     alone = "" if item.robot_file is None else "+" + file_checksum(item.robot_file)
     return file_checksum(item.file) + alone
 
@@ -240,10 +256,10 @@ def write_whole(path: Path, content: bytes) -> None:
 def _read(task: Task, batch: Batch, item: Item) -> Result:
     """A recording, and what is measured of it while its numbers are at hand."""
     begin = time.perf_counter()
-    result = Result(item, sha256=_input_checksum(item), reason=item.refused)
+    result = Result(item, sha256=input_checksum(item), reason=item.refused)
     if not result.reason:
         with _reasons(result):
-            recording = _load(task.job.recording, item.file, task.job.folder)
+            recording = load(task.job.recording, item.file, task.job.folder)
             if recording.n_joints != task.joints:
                 raise ValueError(
                     f"{item.file}: it has {recording.n_joints} joints, but this study {task.joints}: name the columns "
@@ -258,7 +274,7 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
     return result
 
 
-def _load(table: Mapping[str, Any], file: Path, folder: Path) -> Recording:
+def load(table: Mapping[str, Any], file: Path, folder: Path) -> Recording:
     """A recording of reasonable size, from a plain file."""
     refused = why_refused(file)
     if refused:
@@ -337,7 +353,7 @@ def joints_of(job: Job, items: Sequence[Item]) -> int:
         if item.file.suffix.lower() not in MATRICES:
             return named
         with suppress(ValueError, OSError):
-            return _load(job.recording, item.file, job.folder).n_joints
+            return load(job.recording, item.file, job.folder).n_joints
     return named
 
 
@@ -359,7 +375,7 @@ def _alone(task: Task, item: Item) -> Recording | None:
 @lru_cache(maxsize=4)
 def _robot_alone(table: str, file: Path, folder: Path, content: str) -> Recording:
     """A file of this content is read once."""
-    return _load(json.loads(table), file, folder)
+    return load(json.loads(table), file, folder)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -377,7 +393,7 @@ def _write_tables(task: Task, batch: Batch, results: Sequence[Result]) -> dict[s
         for k, first in enumerate(members[0].estimates):
             folder = "estimates" if k == 0 else f"estimates_method{first.method}"
             path = "/".join(filter(None, (folder, partition, name)))
-            tables[path] = windows_table(task.job, members, k)
+            tables[path] = windows_table(task, members, k)
     for path, table in tables.items():
         buffer = pa.BufferOutputStream()
         texts = [column.name for column in table.schema if column.type == pa.string()]
@@ -388,19 +404,26 @@ def _write_tables(task: Task, batch: Batch, results: Sequence[Result]) -> dict[s
     return written
 
 
-def windows_table(job: Job, results: Sequence[Result], k: int = 0) -> pa.Table:
-    """One row per window of all recordings: the columns of `estimates.parquet`, behind the recording's name.
+def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table:
+    """One row per window of all recordings: the columns of `estimates.parquet`, behind the recording's name and the
+    manifest's columns.
 
     `condition` is called `condition_number` here: a study has conditions of its own, which partition its results.
     """
-    several = [result.estimates[k] for result in results]
+    several, job = [result.estimates[k] for result in results], task.job
     about = results[0].about
     assert about is not None
     human = job.models(about.joints, about.sample_rate)[1]
     table = estimates_table(_one_after_another(several), human, job)
     table = table.rename_columns({"condition": "condition_number"})
-    names = pa.array(np.repeat([result.item.name for result in results], [len(one.start) for one in several]))
-    return table.add_column(0, pa.field("recording", pa.string(), metadata={"unit": ""}), names.cast(pa.string()))
+    which = pa.array(np.repeat(np.arange(len(results)), [len(one.start) for one in several]))
+    metadata = [dict(result.item.metadata) for result in results]
+    columns = {"recording": [result.item.name for result in results]}
+    columns |= {name: [row.get(name, "") for row in metadata] for name in task.metadata}
+    for place, (name, texts) in enumerate(columns.items()):
+        field = pa.field(name, pa.string(), metadata={"unit": ""})
+        table = table.add_column(place, field, _texts(texts).take(which))
+    return table
 
 
 def _one_after_another(several: Sequence[Estimates]) -> Estimates:
@@ -577,7 +600,7 @@ def write_late_report(task: Task, item: Item) -> str:
     """The report of a recording that was identified before, and nothing; or why there is none."""
     found = Result(item)
     with _reasons(found):
-        found.recording = _load(task.job.recording, item.file, task.job.folder)
+        found.recording = load(task.job.recording, item.file, task.job.folder)
     return found.reason if found.recording is None else _write_report(task, item, found.recording)
 
 
@@ -585,7 +608,11 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
     """Nothing, or why it could not be written: a report that fails must not cost a batch."""
     found = Result(item)
     with _one_at_a_time, _reasons(found):
-        write_report_of(task.job, recording, _alone(task, item), report_folder(task.out, item.name))
+        about = {"recording": str(item.file), **dict(item.metadata)}
+        lines = [printable(f"# {name}: {' '.join(value.split())}\n") for name, value in about.items()]
+        job = replace(task.job, text="".join(lines) + task.job.text)
+        named = replace(recording, name=item.name)
+        write_report_of(job, named, _alone(task, item), report_folder(task.out, item.name))
     return found.reason
 
 

@@ -34,6 +34,8 @@ app = typer.Typer(
     "and proposes filters and a window, `jaximp identify JOB.toml --out DIR` writes estimates and a report.",
 )
 console = Console(stderr=True, highlight=False)
+MOST_LINES = 50
+"""Recordings that failed and are named one by one; quarantine.json has all."""
 
 JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to identify, from which recording.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write; it must not exist yet.")]
@@ -249,10 +251,13 @@ def batch(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done.")] = False,
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Take up a run that was broken off.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Do what is missing or has changed.")] = False,
     reports: Annotated[
         list[str] | None,
-        typer.Option("--reports", help="all, failed, none, or a recording's name (many times): which get a report."),
+        typer.Option(
+            "--reports",
+            help="Which get a report: all, none, failed (not a single trusted window), or names (many times).",
+        ),
     ] = None,
     partition: Annotated[list[str] | None, typer.Option("--partition", help="Column of the manifest.")] = None,
     allow_outside: Annotated[bool, typer.Option("--allow-outside", help="A manifest may name any path.")] = False,
@@ -265,7 +270,7 @@ def batch(
     them. What fails is listed in quarantine.json, and the rest goes on; the exit status is 3 then. A run that was
     broken off goes on with --resume, which also writes reports that are asked for later.
     """
-    from jaximp.batch import check_metadata, run_plan
+    from jaximp.batch import check_metadata, first_trouble, run_plan
     from jaximp.batch_plan import find_items, make_plan
     from jaximp.job import read_job
 
@@ -273,23 +278,37 @@ def batch(
     plan = make_plan(job, find_items(files or [], manifest, allow_outside), partition)
     if dry_run:
         check_metadata(job, plan)
-        for line in plan.in_words(job):
+        for line in filter(None, [*plan.in_words(job), first_trouble(job, plan)]):
             typer.echo(line)
         return
     chosen = reports[0] if reports and len(reports) == 1 else reports or "none"
     with _interruptible(), _events(len(plan.items), quiet, json_lines) as tell:
         outcome = run_plan(job, plan, out, workers, scheduler, resume, chosen, tell)
     if not json_lines:
-        for failed in outcome.failed:
+        for failed in outcome.failed[:MOST_LINES]:
             console.print(f"failed: {failed['recording']}: {failed['reason']}", markup=False, soft_wrap=True)
+        if len(outcome.failed) > MOST_LINES:
+            others = len(outcome.failed) - MOST_LINES
+            console.print(f"failed: {others} others: {out.resolve() / 'quarantine.json'}", soft_wrap=True)
         for broken in outcome.broken:
             console.print(f"unfinished: {broken}; run again with --resume", markup=False, soft_wrap=True)
     if not (quiet or json_lines):
         done = outcome.recordings - len(outcome.failed)
-        typer.echo(f"{done} of {outcome.recordings} recordings, {outcome.trusted} of {outcome.windows} windows trusted")
+        typer.echo(
+            f"{done} of {outcome.recordings} recordings identified, "
+            f"{outcome.trusted} of {outcome.windows} windows trusted"
+        )
+        if resume:
+            typer.echo(f"{outcome.skipped} were done already, {outcome.recordings - outcome.skipped} were done now")
+        if outcome.dropped:
+            typer.echo(f"{outcome.dropped} of an earlier run are not among them: their results were removed")
+        if outcome.outdated:
+            typer.echo(f"{outcome.outdated} reports of an earlier run were removed: ask for them again with --reports")
         if outcome.doubted:
             typer.echo(f"{outcome.doubted} without a trusted window; {outcome.doubt}")
         typer.echo(f"results: {out.resolve()}\noverview: {out.resolve() / 'overview.html'}")
+        if (out / "reports").is_dir():
+            typer.echo(f"reports: {out.resolve() / 'reports'}")
     if outcome.exit_status:
         raise typer.Exit(outcome.exit_status)
 

@@ -23,6 +23,8 @@ Sections = NDArray[np.float64] | tuple[tuple[float, ...], ...]
 """Second-order sections (k, 6): an array, or plain numbers by which compiled code can be found again."""
 BLOCK = 64
 """Samples that a filter takes in one product."""
+SLOW = 5.0
+"""Sample rate at which nobody records a motion [Hz]: milliseconds that were read as seconds."""
 
 
 def require_float64(*arrays: object) -> None:
@@ -46,8 +48,10 @@ def butterworth(order: int, cutoff: float, sample_rate: float, kind: str = "lowp
     if not (isinstance(order, int | np.integer) and order > 0):
         raise ValueError(f"the filter's order is {order}: it must be a whole number above zero")
     if not 0 < cutoff < sample_rate / 2:
+        slow = "; is the time in ms? Then give its unit" if sample_rate <= SLOW else ""
         raise ValueError(
             f"the {kind} cut-off of {cutoff:g} Hz must lie between 0 and {sample_rate / 2:g} Hz, half the sample rate"
+            + slow
         )
     return np.asarray(butter(order, cutoff, kind, fs=sample_rate, output="sos"))
 

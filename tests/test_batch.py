@@ -88,7 +88,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study")
     for k, n in enumerate(LENGTHS):
         save_recording(joint(n, k, stiffness=20.0 + k), folder / f"r{k}.parquet")
-    subjects = ["S1", "S1", "<script>alert(1)</script>", "../x", "S1", "S2", "..", ""]
+    subjects = ["S1", "1", "<script>alert(1)</script>", "../x", "01", "S2", "..", ""]
     rows = [f"r{k}.parquet,{subject},{k % 2}" for k, subject in enumerate(subjects)]
     (folder / "study.csv").write_text("file,subject,arm\n" + "\n".join(rows) + "\n")
     (folder / "job.toml").write_text(JOB)
@@ -273,8 +273,9 @@ def test_the_data_set_holds_what_identify_finds(study: Path) -> None:
     assert recordings.schema.field("stiffness_mean").metadata == {b"unit": b"N m/rad"}
     import pyarrow.dataset as ds
 
-    windows = ds.dataset(out / "estimates", format="parquet", partitioning="hive").to_table()
-    assert set(windows["subject"].to_pylist()) == {"S1", "<script>alert(1)</script>", "../x", "S2", "..", "missing"}
+    windows = ds.dataset(out / "estimates", format="parquet").to_table()
+    stated = dict(zip(recordings["recording"].to_pylist(), recordings["subject"].to_pylist(), strict=True))
+    assert {(row["recording"], row["subject"]) for row in windows.to_pylist()} == set(stated.items())
     for k in (0, 2):
         expected = identify_recording(job, joint(LENGTHS[k], k, stiffness=20.0 + k))[0]
         rows = windows.filter(pa.compute.equal(windows["recording"], f"r{k}.parquet")).sort_by("start_s")
@@ -294,18 +295,18 @@ def test_every_reader_reads_it(study: Path, reader: str) -> None:
     if reader == "pandas":
         windows = library.read_parquet(out / "estimates")
         counts = windows.groupby("recording", observed=True).size().sort_index().tolist()
-        subjects = set(windows["subject"].dropna())
+        subjects = set(windows["subject"])
     elif reader == "polars":
         windows = library.read_parquet(out / "estimates")
         counts = windows.group_by("recording").len().sort("recording")["len"].to_list()
-        subjects = set(windows["subject"].drop_nulls())
+        subjects = set(windows["subject"])
     else:
-        where = f"read_parquet('{out}/estimates/**/*.parquet', hive_partitioning = true)"
+        where = f"'{out}/estimates/**/*.parquet'"
         query = f"SELECT count(*) FROM {where} GROUP BY recording ORDER BY recording"
         counts = [count for (count,) in library.sql(query).fetchall()]
         subjects = {subject for (subject,) in library.sql(f"SELECT DISTINCT subject FROM {where}").fetchall()}
     assert counts == expected
-    assert {"S1", "S2", "../x", "..", "<script>alert(1)</script>"} <= subjects
+    assert {"S1", "S2", "../x", "..", "<script>alert(1)</script>", "1", "01", ""} == subjects
 
 
 def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
@@ -334,7 +335,7 @@ def test_a_study_has_conditions_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "study.csv").write_text("file,condition\na.parquet,tense\n")
     job = parse_job(JOB, tmp_path)
     batch.run(job, out=tmp_path / "out", manifest=tmp_path / "study.csv")
-    table = ds.dataset(tmp_path / "out/estimates", format="parquet", partitioning="hive").to_table()
+    table = ds.dataset(tmp_path / "out/estimates", format="parquet").to_table()
     assert set(table["condition"].to_pylist()) == {"tense"}
     expected = identify_recording(job, joint(1000))[0]
     np.testing.assert_allclose(table["condition_number"], expected.fit.cond, 1e-6)
@@ -696,7 +697,10 @@ def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert dict(zip(table["recording"].to_pylist(), table["status"].to_pylist(), strict=True))["good.parquet"] == "ok"
 
 
-@pytest.mark.parametrize(("reports", "expected"), [("none", []), ("failed", ["noise"]), ("all", ["good", "noise"])])
+REPORTS = [("none", []), ("failed", ["noise.parquet"]), ("all", ["good.parquet", "noise.parquet"])]
+
+
+@pytest.mark.parametrize(("reports", "expected"), REPORTS)
 def test_reports_are_those_that_were_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reports: str, expected: list[str]
 ) -> None:
@@ -739,7 +743,7 @@ def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     batch.run(job, files, out)
     assert "reports/" not in (out / "overview.html").read_text()
     assert batch.run(job, files, out, resume=True, reports=["b.parquet"]).skipped == 2
-    assert [path.read_text() for path in out.glob("reports/*/report.html")] == ["b"]
+    assert [path.read_text() for path in out.glob("reports/*/report.html")] == ["b.parquet"]
     assert "./reports/b.parquet/report.html" in (out / "overview.html").read_text()
     with pytest.raises(ValueError, match="there is no recording 'c'"):
         batch.run(job, files, out, resume=True, reports=["c"])
@@ -747,6 +751,28 @@ def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     batch.run(job, files, out, resume=True)
     assert not list(out.glob("reports/*"))
     assert "reports/" not in (out / "overview.html").read_text()
+
+
+def test_what_did_not_change_keeps_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it is done again with those beside it; and what another run leaves out is told."""
+
+    def write(job: Job, one: Recording, alone: Recording | None, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        (folder / "report.html").write_text(f"{one.name} {job.text.splitlines()[0]}")
+
+    monkeypatch.setattr(batch_results, "write_report_of", write)
+    files = [tmp_path / f"{name}.parquet" for name in "abc"]
+    for k, file in enumerate(files):
+        save_recording(joint(1000, k), file)
+    job, out = parse_job(JOB), tmp_path / "out"
+    batch.run(job, files, out, reports="all")
+    assert (out / "reports/a.parquet/report.html").read_text() == f"a.parquet # recording: {files[0]}"
+    save_recording(joint(1000, 9), files[0])
+    again = batch.run(job, files, out, resume=True)
+    assert (again.skipped, again.outdated, again.dropped) == (0, 1, 0)
+    assert sorted(path.name for path in (out / "reports").iterdir()) == ["b.parquet", "c.parquet"]
+    assert batch.run(job, files[:2], out, resume=True).dropped == 1
+    assert batch.run(parse_job(JOB + "[trust]\nmin_vaf = 0.8\n"), files[:2], out, resume=True).outdated == 1
 
 
 def test_a_report_that_fails_costs_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -889,7 +915,9 @@ def test_columns_may_have_the_endings_of_results(study: Path, tmp_path: Path) ->
     [
         ("file\na.csv\nsub/../a.csv\n", "more than once"),
         ("file,subject, subject\na.csv,1,2\n", "same name"),
-        ("subject\nS1\n", "column 'file'"),
+        ("subject\nS1\n", "column 'file' .*, but its columns are subject: rename"),
+        ("file,File\na.csv,b.csv\n", "same name"),
+        ("file\n\n", "has no rows"),
         ("file\na.csv\na.csv\n", "more than once"),
         ("file,subject\na.csv\n", "more or fewer fields"),
         ("file,robot_file\na.csv,b.csv\n", "no \\[robot_recording\\]"),
@@ -915,13 +943,22 @@ def test_a_job_with_trials_is_refused() -> None:
 def test_manifests_are_what_spreadsheets_write(tmp_path: Path) -> None:
     """With a mark at the beginning and semicolons, too; a path from Windows is told what is wrong with it."""
     save_recording(joint(1000), tmp_path / "a b.parquet")
-    (tmp_path / "study.csv").write_text("file;subject\na b.parquet;1\n.\\a b.parquet;2\n", encoding="utf-8-sig")
+    text = "File;Subject\na b.parquet;1\n.\\a b.parquet;2\n;\n"
+    (tmp_path / "study.csv").write_text(text, encoding="utf-8-sig")
     plan = make_plan(parse_job(JOB), find_items([], tmp_path / "study.csv"))
     assert [item.metadata for item in plan.items] == [(("subject", "1"),), (("subject", "2"),)]
-    assert plan.in_words(parse_job(JOB))[:2] == [
-        "2 recordings in 2 batches",
-        "refused: .\\a b.parquet: No such file or directory: check the path; write / between folders",
-    ]
+    words = plan.in_words(parse_job(JOB))
+    assert words[0] == "2 recordings in 2 batches"
+    assert words[1].startswith(f"refused: .\\a b.parquet: there is no file {tmp_path}/.\\a b.parquet: check the path")
+    assert words[1].endswith("write / between folders")
+    assert words[2] == "model: human; windows of 1 s every 0.05 s"
+    assert batch.first_trouble(parse_job(JOB), plan) == ""
+    trouble = batch.first_trouble(parse_job(JOB.replace("torque_Nm", "torque")), plan)
+    assert trouble.startswith("a b.parquet would fail: ")
+    assert "'torque_Nm'" in trouble
+    (tmp_path / "study.csv").write_text("file,subject\na b.parquet,1\n,2\n")
+    with pytest.raises(ValueError, match=r"study.csv, line 3: the column 'file' is empty"):
+        find_items([], tmp_path / "study.csv")
 
 
 def test_a_folder_that_is_there_is_not_touched(study: Path, tmp_path: Path) -> None:
