@@ -70,6 +70,11 @@ HIDDEN = (
     *RUN_COLUMNS,
 )  # fmt: skip
 """Columns of the recordings that the page leaves out."""
+SCALED = ("inertia", "damping", "stiffness")
+"""Parameters that a wrong unit of the position makes larger or smaller alike."""
+ODD, FEWEST = 20.0, 5
+"""How many times larger or smaller than in the median recording they are then (57, if degrees were meant); and of how
+many recordings there is a median to speak of."""
 MOST_GROUPS = 100
 """Groups whose means the page tells; more are no comparison."""
 
@@ -92,6 +97,8 @@ class Outcome:
     doubted: int = 0
     """Recordings without a trusted window, and what is said of the first of them."""
     doubt: str = ""
+    odd: dict[str, str] = field(default_factory=dict)
+    """Recordings whose parameters are of another size than those of the study."""
     broken: list[str] = field(default_factory=list)
     """Batches that could not be finished, and why: `resume` does them again."""
 
@@ -180,7 +187,9 @@ def run_plan(
             if len(outcome.broken) < len(plan.batches):
                 earlier = {item for batch in {*plan.batches} - {*left} for item in batch.items}
                 _write_late_reports(task, sorted(earlier, key=lambda item: item.name), log)
-                write_page(out, plan.metadata, plan.partitions)
+                outcome.odd = write_page(out, plan.metadata, plan.partitions)
+                for name, why in outcome.odd.items():
+                    log({"event": "odd", "recording": name, "reason": why})
         except OSError as error:
             outcome.broken.append(f"{PAGE}: {error.strerror or error}")
         log(
@@ -478,27 +487,29 @@ def read_recordings(out: str | Path) -> pa.Table:
     return pa.concat_tables(tables, promote_options="permissive").sort_by("recording")
 
 
-def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[str] = ()) -> None:
+def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[str] = ()) -> dict[str, str]:
     """The overview of a finished batch (`overview.write_overview`), with links to the reports that there are.
 
     **Arguments:** `metadata` the manifest's columns, whose empty values are not known; `groups` those whose values are
     compared. Subjects are none: they are what is averaged.
+
+    **Returns:** recordings whose parameters are of another size than those of the study, and what is said of them.
     """
     out = Path(out)
     table = read_recordings(out)
     found = [name for name in table.column_names if name not in metadata]
     parameters = [name.removesuffix("_mean") for name in found if name.endswith("_mean")]
+    odd = _odd(table, [name for name in parameters if name.endswith(SCALED)])
+    names, reasons = table["recording"].to_pylist(), table["reason"].to_pylist()
+    table = _with_texts(table, "reason", [odd.get(name, why) for name, why in zip(names, reasons, strict=True)])
     details = {f"{name}{end}" for name in parameters for end in ("_median_stderr", "_half_width_95")}
     table = table.select([name for name in table.column_names if name not in {*HIDDEN, *details}])
     for name in metadata:
-        place, texts = table.column_names.index(name), table[name].to_pylist()
-        table = table.set_column(
-            place, table.schema.field(name), pa.array([text or None for text in texts], pa.string())
-        )
+        table = _with_texts(table, name, [text or None for text in table[name].to_pylist()])
     groups = [name for name in groups if name != "subject"]
     if groups and len(set(zip(*(table[name].to_pylist() for name in groups), strict=True))) > MOST_GROUPS:
         groups = []
-    reports = {name: report_folder(out, name) / "report.html" for name in table["recording"].to_pylist()}
+    reports = {name: report_folder(out, name) / "report.html" for name in names}
     links = {name: file.relative_to(out).as_posix() for name, file in reports.items() if file.is_file()}
     series = _series(out, main_parameter(parameters)) if parameters else {}
     unfinished = out / f".{PAGE}{UNFINISHED}"
@@ -507,6 +518,28 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
         os.replace(unfinished, out / PAGE)
     finally:
         unfinished.unlink(missing_ok=True)
+    return odd
+
+
+def _with_texts(table: pa.Table, name: str, texts: Sequence[str | None]) -> pa.Table:
+    """The table with other texts in a column."""
+    return table.set_column(table.column_names.index(name), table.schema.field(name), pa.array(texts, pa.string()))
+
+
+def _odd(table: pa.Table, parameters: Sequence[str]) -> dict[str, str]:
+    """Every recording is judged by itself; that one was measured in other units, only the others can tell."""
+    if len(parameters) < 2:
+        return {}
+    sizes = np.abs([table[f"{name}_mean"].to_numpy() for name in parameters])
+    known = np.isfinite(sizes).all(axis=0)
+    if known.sum() < FEWEST:
+        return {}
+    with np.errstate(all="ignore"):
+        ratios = sizes / np.median(sizes[:, known], axis=1, keepdims=True)
+        odd = (ratios > ODD).all(axis=0) | (ratios < 1 / ODD).all(axis=0)
+    names, shares = table["recording"].to_pylist(), [f"{parameters[-1]} is {ratio:.2g} times" for ratio in ratios[-1]]
+    why = "that of the median recording, and the other parameters likewise: are its units those of the others?"
+    return {names[k]: f"{shares[k]} {why}" for k in np.flatnonzero(odd)}
 
 
 def _series(out: Path, parameter: str) -> dict[str, Series]:

@@ -304,6 +304,8 @@ def batch(
             typer.echo(f"{outcome.dropped} of an earlier run are not among them: their results were removed")
         if outcome.outdated:
             typer.echo(f"{outcome.outdated} reports of an earlier run were removed: ask for them again with --reports")
+        for name, why in list(outcome.odd.items())[:MOST_LINES]:
+            typer.echo(f"{name}: {why}")
         if outcome.doubted:
             typer.echo(f"{outcome.doubted} without a trusted window; {outcome.doubt}")
         typer.echo(f"results: {out.resolve()}\noverview: {out.resolve() / 'overview.html'}")

@@ -728,6 +728,21 @@ def test_where_nothing_is_trusted_it_is_said_why(tmp_path: Path) -> None:
         assert (outcome.doubted, outcome.doubt) == (1, f"rests.parquet: {reasons[1]}")
 
 
+def test_other_units_are_noticed(tmp_path: Path) -> None:
+    """Of one recording alone nobody could tell; a soft joint among stiff ones is none of these."""
+    for k in range(6):
+        one = joint(1000, k, stiffness=0.5 if k == 5 else 20.0)
+        if k == 0:
+            one = recording_from_arrays(one.time, np.degrees(one.position), one.torque)
+        save_recording(one, tmp_path / f"r{k}.parquet")
+    outcome = batch.run(parse_job(JOB), [tmp_path], tmp_path / "out")
+    assert list(outcome.odd) == ["r0.parquet"]
+    assert outcome.odd["r0.parquet"].startswith("stiffness is 0.017 times that of the median recording")
+    assert "0.017 times" in (tmp_path / "out/overview.html").read_text()
+    few = batch.run(parse_job(JOB), [tmp_path / f"r{k}.parquet" for k in range(4)], tmp_path / "few")
+    assert few.odd == {}
+
+
 def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a recording by its name, though its batch is done; the overview links it. A changed recording loses it."""
 
