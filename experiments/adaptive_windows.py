@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import SlidingFit, adaptive_least_squares, parse_job, plots, sliding_least_squares
-from jaximp.identify import prepare
+from jaximp.identification.identify import prepare
 from jaximp.simulation.rig import HumanLoad
-from jaximp.studies.rig_recordings import rig_recordings
+from jaximp.simulation.rig_recordings import rig_recordings
 
 jax.config.update("jax_enable_x64", True)
 

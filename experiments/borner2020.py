@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from jaximp.studies import borner2020
+from jaximp.papers import borner2020
 
 jax.config.update("jax_enable_x64", True)
 

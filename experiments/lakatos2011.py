@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from jaximp.studies import lakatos2011
+from jaximp.papers import lakatos2011
 
 jax.config.update("jax_enable_x64", True)
 

@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, savgol_filter, sosfilt
 
-from jaximp.isolation import static_inertia
 from jaximp.models import ArmGeometry
-from jaximp.movements import Movements
-from jaximp.output_error import OutputErrorFit, output_error
+from jaximp.perturbation.isolation import static_inertia
+from jaximp.perturbation.movements import Movements
+from jaximp.perturbation.output_error import OutputErrorFit, output_error
 from jaximp.simulation.neuromuscular import (
     ANGLES,
     POSTURES,

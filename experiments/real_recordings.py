@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from jaximp import identify, parse_job
-from jaximp.least_squares import least_squares
-from jaximp.regression import design_filters, noise_of_rows, regress
+from jaximp.identification.regression import design_filters, noise_of_rows, regress
+from jaximp.least_squares.window import least_squares
 
 jax.config.update("jax_enable_x64", True)
 

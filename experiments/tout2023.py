@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from jaximp.studies import tout2023
+from jaximp.papers import tout2023
 
 jax.config.update("jax_enable_x64", True)
 

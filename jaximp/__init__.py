@@ -1,39 +1,20 @@
 """jaximp: mechanical impedance of human joints and arms, and the dynamics of the robots that hold them."""
 
 from jaximp import models
-from jaximp.excitation import Design, Encoder, Limits, design_excitation
-from jaximp.identify import Estimates, identify, identify_recording
-from jaximp.impedance import ArmImpedance, identify_impedance, identify_trials
-from jaximp.inference import Inference, compare_models, infer, infer_recording, infer_trials
-from jaximp.isolation import KnownArm
-from jaximp.job import FilterSettings, Job, parse_job, read_job
-from jaximp.least_squares import SlidingFit, WindowFit, confidence_interval, least_squares
-from jaximp.likelihood import adjusted, estimate_density, linear_density, stiffness_density, window_densities
-from jaximp.movement_trials import judge_sensors, read_movements, read_postures
-from jaximp.movements import Handle, Movements
-from jaximp.noise import Noise, fit_noise, joined, whiten
-from jaximp.perturbations import Perturbations, design_perturbations
-from jaximp.posterior import (
-    ExactPosterior,
-    Posterior,
-    PosteriorMany,
-    derive,
-    exact_posterior,
-    probability_greater,
-    summarise,
-)
-from jaximp.posterior_files import load_posterior, save_posterior, to_inference_data
-from jaximp.priors import LogNormal, MultivariateNormal, Normal, make_prior
-from jaximp.recordings import (
-    load_recording,
-    load_trial_table,
-    recording_from_arrays,
-    save_recording,
-    save_trial_table,
-)
-from jaximp.recursive import RecursiveFit, recursive_least_squares
-from jaximp.samplers import sample_many, sample_posterior
-from jaximp.stiffness import (
+from jaximp.design.excitation import Design, Encoder, Limits, design_excitation
+from jaximp.design.perturbations import Perturbations, design_perturbations
+from jaximp.identification.identify import Estimates, identify, identify_recording
+from jaximp.jobs.job import FilterSettings, Job, parse_job, read_job
+from jaximp.least_squares.noise import Noise, fit_noise, joined, whiten
+from jaximp.least_squares.recursive import RecursiveFit, recursive_least_squares
+from jaximp.least_squares.sliding import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval, least_squares
+from jaximp.motion.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
+from jaximp.perturbation.impedance import ArmImpedance, identify_impedance, identify_trials
+from jaximp.perturbation.isolation import KnownArm
+from jaximp.perturbation.movement_trials import judge_sensors, read_movements, read_postures
+from jaximp.perturbation.movements import Handle, Movements
+from jaximp.perturbation.stiffness import (
     LinearFit,
     StiffnessFit,
     fit_stiffness,
@@ -43,11 +24,37 @@ from jaximp.stiffness import (
     merge_triangles,
     residual_triangle,
 )
-from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
-from jaximp.trials import fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
-from jaximp.trust import TrustLimits, confidence
+from jaximp.perturbation.trials import (
+    fit_trials,
+    joint_trials,
+    load_trials,
+    predict_trials,
+    read_trials,
+    regress_trials,
+)
+from jaximp.posterior.densities import adjusted, estimate_density, linear_density, stiffness_density, window_densities
+from jaximp.posterior.draws import (
+    ExactPosterior,
+    Posterior,
+    PosteriorMany,
+    derive,
+    exact_posterior,
+    probability_greater,
+    summarise,
+)
+from jaximp.posterior.files import load_posterior, save_posterior, to_inference_data
+from jaximp.posterior.inference import Inference, compare_models, infer, infer_recording, infer_trials
+from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, make_prior
+from jaximp.posterior.samplers import sample_many, sample_posterior
+from jaximp.recordings.load import (
+    load_recording,
+    load_trial_table,
+    recording_from_arrays,
+    save_recording,
+    save_trial_table,
+)
+from jaximp.trust.verdicts import TrustLimits, confidence
 from jaximp.types import Recording
-from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 
 __all__ = [
     "ArmImpedance",

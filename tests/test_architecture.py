@@ -13,41 +13,13 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "jaximp"
 
-LAYERS: tuple[tuple[str, ...], ...] = (
-    ("cli",),
-    ("studies",),
-    ("batch",),
-    ("batch_results",),
-    ("report", "impedance_report", "posterior_report", "overview", "check"),
-    ("pages",),
-    ("plots",),
-    ("batch_plan",),
-    ("inference", "stacks"),
-    ("identify", "impedance"),
-    ("trials", "perturbations", "isolation"),
-    ("regression",),
-    ("design",),
-    ("job",),
-    ("design_files", "trial_settings"),
-    ("excitation",),
-    ("payload", "likelihood"),
-    ("trust", "predictive"),
-    ("samplers",),
-    ("posterior_files",),
-    ("posterior",),
-    ("windows", "recursive"),
-    ("chunks", "stiffness", "noise"),
-    ("least_squares", "objectives", "definite", "priors"),
-    ("engine",),
-    ("simulation", "bounds", "movement_trials", "output_error"),
-    ("models", "movements"),
-    ("recordings", "trajectories"),
-    ("signals", "readers", "settings", "optimise"),
-    ("outputs", "types", "compilation"),
-)
-"""From top to bottom; a module imports from strictly lower layers, and a folder from itself."""
+PACKAGES = (
+    "types", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust", "identification",
+    "perturbation", "posterior", "design", "simulation", "jobs", "plots", "reports", "batch", "papers", "cli",
+)  # fmt: skip
+"""From the ground up: a package imports from those before it, and from itself."""
 
-HEIGHT = {name: -depth for depth, layer in enumerate(LAYERS) for name in layer}
+HEIGHT = {name: height for height, name in enumerate(PACKAGES)}
 
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
@@ -75,12 +47,11 @@ def imports(module: str) -> Iterator[str]:
 
 
 def own(module: str) -> Iterator[str]:
-    """The layer of every module of the package that a module imports; the package itself is an empty string."""
+    """The packages that a module imports from; jaximp itself is an empty string."""
     for name in imports(module):
         parts = name.split(".")
         if parts[0] == "jaximp":
-            known = len(parts) > 1 and (parts[1] in HEIGHT or parts[1] in MODULES)
-            yield parts[1] if known else ""
+            yield parts[1] if len(parts) > 1 and parts[1] in HEIGHT else ""
 
 
 def called(module: str) -> Iterator[str]:
@@ -90,14 +61,23 @@ def called(module: str) -> Iterator[str]:
             yield ast.unparse(node.func)
 
 
+STILL_UP = {
+    ("identification.check", "jobs"), ("identification.identify", "jobs"), ("identification.regression", "jobs"),
+    ("identification.stacks", "jobs"), ("perturbation.impedance", "jobs"), ("perturbation.trials", "jobs"),
+    ("posterior.inference", "jobs"),
+    ("numerics.definite", "least_squares"), ("perturbation.isolation", "design"), ("perturbation.trials", "design"),
+}  # fmt: skip
+"""Numerical code that still takes the job as its argument, and linear algebra that has no room of its own yet."""
+
+
 @every_module
-def test_imports_point_down(module: str) -> None:
-    layer = module.split(".")[0]
-    assert layer in HEIGHT, f"'{layer}' is new: give it a layer in this test"
+def test_imports_point_one_way(module: str) -> None:
+    package = module.split(".")[0]
+    assert package in HEIGHT, f"'{package}' is new: give it a place in this test"
     for other in own(module):
-        assert other, f"{module} imports from the package itself: import from the module that holds the name"
-        assert other in HEIGHT, f"'{other}' is new: give it a layer in this test"
-        assert other == layer or HEIGHT[other] < HEIGHT[layer], f"{module} imports {other}, which is not below it"
+        assert other, f"{module} imports from jaximp itself: import from the module that holds the name"
+        if (module, other) not in STILL_UP:
+            assert HEIGHT[other] <= HEIGHT[package], f"{module} imports from {other}, which stands above it"
 
 
 @every_module
@@ -108,7 +88,7 @@ def test_only_plots_imports_matplotlib(module: str) -> None:
 
 @every_module
 def test_only_the_command_line_changes_the_configuration_of_jax(module: str) -> None:
-    if module != "cli":
+    if module != "cli.main":
         assert not [call for call in called(module) if call.endswith("config.update")]
         assert "jax.config" not in imports(module)
         changed = [
@@ -122,13 +102,13 @@ def test_only_the_command_line_changes_the_configuration_of_jax(module: str) -> 
 
 @every_module
 def test_only_the_command_line_prints(module: str) -> None:
-    if module != "cli":
+    if module != "cli.main":
         assert not [call for call in called(module) if call.split(".")[-1] in ("print", "pprint")]
         assert not [call for call in called(module) if call in ("sys.stdout.write", "sys.stderr.write")]
 
 
 def test_importing_the_library_leaves_jax_as_it_is() -> None:
-    below = [f"jaximp.{name}" for name in MODULES if name.split(".")[0] not in ("cli", "studies")]
+    below = [f"jaximp.{name}" for name in MODULES if name.split(".")[0] not in ("cli", "papers")]
     program = (
         "import importlib, jax\n"
         f"for name in ['jaximp', *{below}]:\n"

@@ -22,11 +22,16 @@ import pyarrow.parquet as pq
 import pytest
 from browser import browser, executable
 
-from jaximp import batch, batch_plan, batch_results, readers, stacks, windows
-from jaximp.batch_plan import find_items, make_plan, padded_sizes
-from jaximp.identify import Estimates, identify_recording, in_windows
-from jaximp.job import Job, parse_job, read_job
-from jaximp.recordings import recording_from_arrays, save_recording
+from jaximp.batch import plan as batch_plan
+from jaximp.batch import results as batch_results
+from jaximp.batch import run as batch
+from jaximp.batch.plan import find_items, make_plan, padded_sizes
+from jaximp.identification import stacks
+from jaximp.identification.identify import Estimates, identify_recording, in_windows
+from jaximp.jobs.job import Job, parse_job, read_job
+from jaximp.least_squares import sliding as windows
+from jaximp.recordings import readers
+from jaximp.recordings.load import recording_from_arrays, save_recording
 from jaximp.types import Recording
 
 JOB = """
@@ -199,7 +204,8 @@ def test_one_window_as_long_as_the_recording() -> None:
 def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
     """Two devices, which XLA makes of one processor, give what one gives, and each has half of the recordings."""
     code = (
-        "import jax; jax.config.update('jax_enable_x64', True); from jaximp import batch, job, stacks; import sys\n"
+        "import jax, sys; jax.config.update('jax_enable_x64', True)\n"
+        "from jaximp.batch import run as batch; from jaximp.identification import stacks; from jaximp.jobs import job\n"
         "program, placed = stacks._program, []\n"
         "def seen(*args):\n"
         "    found = program(*args); placed.append(found.y.sharding.device_set); return found\n"
@@ -522,7 +528,7 @@ def damaged_receipt(fault: Fault, out: Path) -> None:
 
 def killed_process(fault: Fault, out: Path) -> None:
     """`kill -9` of the whole run, when the first batch is done."""
-    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", str(fault.study / "job.toml")]
+    command = [sys.executable, "-c", "from jaximp.cli.main import main; main()", "batch", str(fault.study / "job.toml")]
     command += ["--manifest", str(fault.study / "study.csv"), "--out", str(out), "--quiet"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
@@ -682,7 +688,7 @@ def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     (tmp_path / "link.parquet").symlink_to(tmp_path / "good.parquet")
     os.mkfifo(tmp_path / "pipe.parquet")
     (tmp_path / "job.toml").write_text(JOB)
-    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", "job.toml", ".", "--json"]
+    command = [sys.executable, "-c", "from jaximp.cli.main import main; main()", "batch", "job.toml", ".", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 3, done.stderr
     events = [json.loads(line) for line in done.stdout.splitlines()]
@@ -1032,8 +1038,15 @@ def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypa
 
 
 def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from jaximp.cli import main; main()", "batch", str(study / "job.toml"), "--quiet"]
-    command += ["--manifest", str(study / "study.csv"), "--out", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-c",
+        "from jaximp.cli.main import main; main()",
+        "batch",
+        str(study / "job.toml"),
+        "--quiet",
+    ]
+    command += ["--quiet", "--manifest", str(study / "study.csv"), "--out", str(tmp_path / "out")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while not (tmp_path / "out/batch.log").exists() and process.poll() is None:
         time.sleep(0.01)

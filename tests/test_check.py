@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_identify import JOB, TIME, joint
 
-from jaximp.check import BAD, LOOK, check_recording, coherent_bandwidth, estimate_delay
-from jaximp.identify import identify_recording
-from jaximp.job import parse_job
-from jaximp.recordings import recording_from_arrays
+from jaximp.identification.check import BAD, LOOK, check_recording, coherent_bandwidth, estimate_delay
+from jaximp.identification.identify import identify_recording
+from jaximp.jobs.job import parse_job
+from jaximp.recordings.load import recording_from_arrays
 
 
 def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:

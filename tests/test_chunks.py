@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp import windows
-from jaximp.chunks import lags_for_sums
-from jaximp.least_squares import SlidingFit
-from jaximp.windows import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.least_squares import sliding as windows
+from jaximp.least_squares.chunks import lags_for_sums
+from jaximp.least_squares.sliding import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
+from jaximp.least_squares.window import SlidingFit
 
 Numbers = NDArray[np.float64]
 

@@ -10,8 +10,9 @@ import pytest
 from scipy.io import savemat
 from test_identify import TIME, joint
 
-from jaximp import cli, studies
-from jaximp.recordings import save_recording
+from jaximp import papers
+from jaximp.cli import main as cli
+from jaximp.recordings.load import save_recording
 
 JOB = """
 [recording]
@@ -115,7 +116,7 @@ def test_usage_errors_have_status_2(run) -> None:  # type: ignore[no-untyped-def
 
 def test_every_paper_can_be_reproduced() -> None:
     """That of every study which has a function for it."""
-    folder = Path(studies.__file__).parent
+    folder = Path(papers.__file__).parent
     there = {file.stem for file in folder.glob("*.py") if "\ndef reproduce(" in file.read_text(encoding="utf-8")}
     assert there == {paper.value for paper in cli.Paper} == {"tout2023", "lakatos2011", "borner2020"}
 

@@ -12,10 +12,10 @@ import yaml
 from typer.testing import CliRunner
 
 from jaximp import identify_recording, parse_job, recording_from_arrays
-from jaximp.cli import app
-from jaximp.design import parse_design_job, read_design_job
-from jaximp.design_files import read_trajectory
-from jaximp.trust import fake_change_threshold
+from jaximp.cli.main import app
+from jaximp.design.files import read_trajectory
+from jaximp.jobs.design import parse_design_job, read_design_job
+from jaximp.trust.verdicts import fake_change_threshold
 
 JOB = """
 [model]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp import excitation, objectives
-from jaximp.bounds import condition_bound
-from jaximp.excitation import Design, Encoder, Limits, design_excitation
+from jaximp.design import excitation, objectives
+from jaximp.design.bounds import condition_bound
+from jaximp.design.excitation import Design, Encoder, Limits, design_excitation
+from jaximp.design.optimise import METHODS, minimise, onto_polytope
 from jaximp.models import HumanJoint, Joints, Model, RobotJoint
-from jaximp.optimise import METHODS, minimise, onto_polytope
-from jaximp.trajectories import FourierSeries, jerk
+from jaximp.motion.trajectories import FourierSeries, jerk
 
 Numbers = NDArray[np.float64]
 HUMAN, ROBOT = HumanJoint(offset=False), RobotJoint(gear_ratio=15)
@@ -289,7 +289,7 @@ def test_no_motion_is_better_than_the_bound(model: Model, harmonics: int, period
 
 def test_the_closed_form_is_the_convex_program() -> None:
     pytest.importorskip("cvxpy")
-    from jaximp import bounds
+    from jaximp.design import bounds
 
     assert bounds._convex_bound([np.eye(4)[:3]], 5, 10.0) == pytest.approx(FLOOR, rel=1e-6)
 

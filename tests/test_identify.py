@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaximp.identify import identify, identify_recording, in_windows, prepare
-from jaximp.job import parse_job
-from jaximp.least_squares import confidence_interval
+from jaximp.identification.identify import identify, identify_recording, in_windows, prepare
+from jaximp.jobs.job import parse_job
+from jaximp.least_squares.window import confidence_interval
 from jaximp.models import PlanarArm
-from jaximp.recordings import recording_from_arrays
+from jaximp.recordings.load import recording_from_arrays
 from jaximp.types import Recording
 
 TIME = np.arange(8000) * 1e-3

@@ -15,14 +15,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaximp import cli, impedance
-from jaximp.impedance import ArmImpedance, at_other_windows, identify_impedance, identify_trials
-from jaximp.isolation import METHODS, Deviations, Impedance, Isolated, JointDeviations, KnownArm, Method
-from jaximp.job import parse_job, read_job
+from jaximp.cli import main as cli
+from jaximp.jobs.job import parse_job, read_job
 from jaximp.models import ArmGeometry
-from jaximp.movement_trials import handle_disagreement
-from jaximp.movements import Handle, Movements
-from jaximp.trust import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
+from jaximp.perturbation import impedance
+from jaximp.perturbation.impedance import ArmImpedance, at_other_windows, identify_impedance, identify_trials
+from jaximp.perturbation.isolation import METHODS, Deviations, Impedance, Isolated, JointDeviations, KnownArm, Method
+from jaximp.perturbation.movement_trials import handle_disagreement
+from jaximp.perturbation.movements import Handle, Movements
+from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
 
 NASTY = "<script>alert(1).csv"
 FIGURES = {"deviations", "spectra", "torques", "ellipses", "windows", "methods"}

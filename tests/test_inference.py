@@ -14,15 +14,17 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 from test_identify import JOB, TIME, TRUTH, joint
 
-from jaximp import cli, inference, posterior_report
-from jaximp.identify import prepare
-from jaximp.inference import Inference, compare_models, infer_recording, sentences
-from jaximp.job import parse_job
+from jaximp.cli import main as cli
+from jaximp.identification.identify import prepare
+from jaximp.jobs.job import parse_job
 from jaximp.models import HumanJoint, Joints, Model, ReflexPathway, RobotJoint
-from jaximp.posterior import Posterior, make_posterior, stacked
-from jaximp.posterior_files import load_posterior
-from jaximp.predictive import PriorPredictive
-from jaximp.recordings import recording_from_arrays, save_recording
+from jaximp.posterior import inference
+from jaximp.posterior.draws import Posterior, make_posterior, stacked
+from jaximp.posterior.files import load_posterior
+from jaximp.posterior.inference import Inference, compare_models, infer_recording, sentences
+from jaximp.posterior.predictive import PriorPredictive
+from jaximp.recordings.load import recording_from_arrays, save_recording
+from jaximp.reports import posterior as posterior_report
 from jaximp.types import Recording
 
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximp.isolation import (
+from jaximp.papers.arm_experiments import Case, Experiment, normalised_errors, run_case, true_deviations
+from jaximp.perturbation.isolation import (
     METHODS,
     Deviations,
     JointDeviations,
@@ -23,9 +24,8 @@ from jaximp.isolation import (
     state_at_onset,
     static_inertia,
 )
-from jaximp.movements import Movements
+from jaximp.perturbation.movements import Movements
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm
-from jaximp.studies.arm_experiments import Case, Experiment, normalised_errors, run_case, true_deviations
 
 ARM = NeuromuscularArm()
 KNOWN = KnownArm(ARM.geometry, ARM.inertia, ARM.handle)
@@ -125,7 +125,7 @@ def test_integration_is_by_trapezia(experiment: Experiment, monkeypatch: pytest.
     def rectangles(x: Any, rate: float) -> Any:
         return jnp.cumsum(x, axis=1) / rate
 
-    monkeypatch.setattr("jaximp.isolation._integral", rectangles)
+    monkeypatch.setattr("jaximp.perturbation.isolation._integral", rectangles)
     jax.clear_caches()
     wrong = feedback_jerk_isolation(experiment.perturbed, experiment.twins, KNOWN).deviations
     jax.clear_caches()

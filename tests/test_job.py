@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jaximp.job import parse_job, read_job
+from jaximp.jobs.job import parse_job, read_job
 from jaximp.models import HumanJoint, Joints, RobotJoint
 
 GOOD = """

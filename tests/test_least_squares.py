@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 from scipy.stats import t as student
 
-from jaximp.least_squares import (
+from jaximp.least_squares.window import (
     DENSE_ROWS,
     WindowFit,
     confidence_interval,
@@ -243,7 +243,7 @@ import jax
 import numpy as np
 from scipy.linalg import toeplitz
 jax.config.update("jax_enable_x64", True)
-from jaximp.least_squares import least_squares
+from jaximp.least_squares.window import least_squares
 for n, more in ((100, 0), (100, 500), (700, 0), (700, 500)):
     W = np.random.default_rng(0).normal(size=(n, 2))
     y, lags = W.sum(axis=1) + np.random.default_rng(1).normal(size=n), 0.99 ** np.arange(n + more)

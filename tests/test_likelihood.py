@@ -18,19 +18,7 @@ from scipy.signal import fftconvolve, lfilter
 from scipy.stats import chi2, kstest, lognorm, multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student
 
-from jaximp import signals
-from jaximp.likelihood import (
-    STIFFNESS,
-    Density,
-    adjusted,
-    estimate_density,
-    linear_density,
-    stiffness_density,
-    stiffness_matrices,
-    window_densities,
-)
-from jaximp.models import PlanarArm
-from jaximp.noise import (
+from jaximp.least_squares.noise import (
     Noise,
     attenuation,
     corrected,
@@ -45,9 +33,21 @@ from jaximp.noise import (
     whitened_covariance,
     whiteness,
 )
-from jaximp.predictive import log_score, log_scores, prior_predictive, torque_bands
-from jaximp.priors import LogNormal, MultivariateNormal, Normal, make_prior
-from jaximp.stiffness import fit_triangles, merge_triangles, residual_triangle
+from jaximp.models import PlanarArm
+from jaximp.perturbation.stiffness import fit_triangles, merge_triangles, residual_triangle
+from jaximp.posterior.densities import (
+    STIFFNESS,
+    Density,
+    adjusted,
+    estimate_density,
+    linear_density,
+    stiffness_density,
+    stiffness_matrices,
+    window_densities,
+)
+from jaximp.posterior.predictive import log_score, log_scores, prior_predictive, torque_bands
+from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, make_prior
+from jaximp.signals import filters as signals
 
 Numbers = NDArray[np.float64]
 
@@ -314,7 +314,7 @@ def test_long_records_are_whitened_piece_by_piece(monkeypatch: pytest.MonkeyPatc
     n, valid = len(y), np.ones(len(y), bool)
     valid[n // 2 : n // 2 + 40] = False
     pieces = whiten(W, y, r, valid)
-    monkeypatch.setattr("jaximp.noise.PIECE", 10**6)
+    monkeypatch.setattr("jaximp.least_squares.noise.PIECE", 10**6)
     whole = whiten(W, y, r, valid)
     assert np.abs(pieces.W - whole.W).max() > 0
     left, same = (residuals(rows, optimum(rows)) for rows in (pieces, whole))

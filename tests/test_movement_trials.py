@@ -14,14 +14,26 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from jaximp.job import Job, parse_job
+from jaximp.jobs.job import Job, parse_job
 from jaximp.models import ArmGeometry
-from jaximp.movement_trials import VOLUNTARY_DELAY, find_onset, judge_sensors, read_movements, read_postures
-from jaximp.movements import Handle, Movements
-from jaximp.recordings import load_recording, load_trial_table, recording_from_arrays, save_recording, save_trial_table
-from jaximp.signals import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
+from jaximp.perturbation.movement_trials import (
+    VOLUNTARY_DELAY,
+    find_onset,
+    judge_sensors,
+    read_movements,
+    read_postures,
+)
+from jaximp.perturbation.movements import Handle, Movements
+from jaximp.recordings.load import (
+    load_recording,
+    load_trial_table,
+    recording_from_arrays,
+    save_recording,
+    save_trial_table,
+)
+from jaximp.signals.filters import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
+from jaximp.simulation.arm_recordings import Sensors, arm_movements, as_recordings
 from jaximp.simulation.neuromuscular import ANGLES, POSTURES, NeuromuscularArm, Reaches, hold_posture
-from jaximp.studies.arm_recordings import Sensors, arm_movements, as_recordings
 from jaximp.types import Recording
 
 HANDLE = Handle((5.0, 5.0), (20.0, 20.0))

@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import nnls
 
 from jaximp.models import mass_matrix
-from jaximp.movements import Handle
+from jaximp.papers.arm_experiments import subject
+from jaximp.perturbation.movements import Handle
 from jaximp.simulation.neuromuscular import (
     RATE,
     Drive,
@@ -26,7 +27,6 @@ from jaximp.simulation.neuromuscular import (
     reach,
     step,
 )
-from jaximp.studies.arm_experiments import subject
 
 ARM, TASK = NeuromuscularArm(), Reach()
 SAMPLES = round(TASK.duration * RATE) + 1

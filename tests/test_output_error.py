@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximp import output_error as module
 from jaximp.models import ArmGeometry
-from jaximp.movements import Movements
-from jaximp.output_error import OutputErrorFit, output_error
+from jaximp.perturbation import output_error as module
+from jaximp.perturbation.movements import Movements
+from jaximp.perturbation.output_error import OutputErrorFit, output_error
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach, neural_noise, perturbing_forces, reach
 
 ARM = NeuromuscularArm()

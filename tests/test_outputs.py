@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from jaximp.outputs import new_folder
+from jaximp.recordings.outputs import new_folder
 
 
 def test_takes_its_name_when_finished(tmp_path: Path) -> None:

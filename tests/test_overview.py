@@ -16,9 +16,9 @@ import pytest
 from browser import Browser, browser, executable
 from scipy import stats
 
-from jaximp import overview
-from jaximp.overview import Series, group_means, thinned, write_overview
-from jaximp.pages import table_of
+from jaximp.batch import overview
+from jaximp.batch.overview import Series, group_means, thinned, write_overview
+from jaximp.reports.pages import table_of
 
 NASTY = "<script>window.ran = 1</script>"
 REASON = "it says </script><img src=x onerror='window.ran = 2'> and <!-- and \u2028 & more"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.least_squares import WindowFit, least_squares
+from jaximp.identification.separation import METHODS, Regression, Separation, fit_robot, separate
+from jaximp.least_squares.window import WindowFit, least_squares
 from jaximp.models import HumanJoint, RobotJoint, combine
-from jaximp.payload import METHODS, Regression, Separation, fit_robot, separate
 
 Numbers = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximp.excitation import Limits
+from jaximp.design.excitation import Limits
+from jaximp.design.perturbations import condition_of, design_perturbations
 from jaximp.models import PlanarArm
-from jaximp.perturbations import condition_of, design_perturbations
+from jaximp.papers.lakatos2011 import noise_free_conditions
 from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, imposed_motion
-from jaximp.studies.lakatos2011 import noise_free_conditions
 
 POSTURE = np.asarray(HeldArm().posture)
 INERTIA = np.asarray(HeldArm().inertia)

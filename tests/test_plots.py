@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identify import Estimates, identify_recording
-from jaximp.job import parse_job
+from jaximp.identification.identify import Estimates, identify_recording
+from jaximp.jobs.job import parse_job
 from jaximp.models import ArmGeometry, EndpointImpedance, endpoint_impedance
 from jaximp.plots.style import POINTS, draw_line
-from jaximp.trust import TRUSTED, WEAK, Verdicts
+from jaximp.trust.verdicts import TRUSTED, WEAK, Verdicts
 from jaximp.types import Recording
 
 JOB = """

@@ -22,8 +22,9 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Float
 from scipy import stats
 
-from jaximp import plots, posterior_files
-from jaximp.posterior import (
+from jaximp import plots
+from jaximp.posterior import files as posterior_files
+from jaximp.posterior.draws import (
     ESS_LEAST,
     Posterior,
     PosteriorMany,
@@ -35,8 +36,8 @@ from jaximp.posterior import (
     probability_greater,
     summarise,
 )
-from jaximp.posterior_files import load_posterior, save_posterior
-from jaximp.samplers import sample_many, sample_posterior
+from jaximp.posterior.files import load_posterior, save_posterior
+from jaximp.posterior.samplers import sample_many, sample_posterior
 
 EIGHT = ("D11", "D12", "D21", "D22", "l11", "l21", "l22", "log_noise")
 
@@ -446,7 +447,7 @@ def test_a_run_that_is_killed_resumes(tmp_path: Path) -> None:
         sys.path[:0] = {path!r}
         import jax
         jax.config.update("jax_enable_x64", True)
-        from jaximp import samplers
+        from jaximp.posterior import samplers
         samplers.SAVE_EVERY = 0
         from test_posterior import chain_run
         from pathlib import Path
@@ -567,7 +568,7 @@ def test_its_error_is_that_of_repetition() -> None:
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=20), st.lists(st.integers(0, 5), min_size=1, max_size=20))
 @settings(deadline=None, max_examples=40)
 def test_shares_below_count_every_pair(a: list[int], b: list[int]) -> None:
-    from jaximp.posterior import _share_below
+    from jaximp.posterior.draws import _share_below
 
     x, y = np.array(a, float), np.array(b, float)
     pairs = (y[:, None] < x).mean(axis=0) + (y[:, None] == x).mean(axis=0) / 2

@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jaximp.recordings import load_recording, recording_from_arrays, recording_from_mapping, save_recording
+from jaximp.recordings.load import load_recording, recording_from_arrays, recording_from_mapping, save_recording
 from jaximp.types import Recording
 
 CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference", "command")
@@ -232,7 +232,7 @@ def test_degrees_and_radians_agree(tmp_path_factory: pytest.TempPathFactory, q: 
 def test_si_units_need_no_unit_library(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", **signals())
     code = (
-        "import sys; from jaximp.recordings import load_recording as load;"
+        "import sys; from jaximp.recordings.load import load_recording as load;"
         "heavy = {'pint', 'pandas', 'pyarrow', 'h5py'}; assert not heavy & set(sys.modules), 'at import';"
         "load('a.npz', time='t', position={'column': 'q', 'unit': 'rad'}, torque={'column': 'tau', 'unit': 'Nm'});"
         "assert not heavy & set(sys.modules), 'after loading'"

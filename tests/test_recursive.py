@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.recursive import init, recursive_least_squares, step
+from jaximp.least_squares.recursive import init, recursive_least_squares, step
 
 Numbers = NDArray[np.float64]
 THETA = np.array([0.1, 1.5, 20.0])

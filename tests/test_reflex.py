@@ -16,10 +16,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
-from jaximp import excitation, report
-from jaximp.identify import Estimates, identify, identify_recording, in_windows, prepare
-from jaximp.job import FilterSettings, Job, parse_job
-from jaximp.least_squares import least_squares
+from jaximp.design import excitation
+from jaximp.identification.identify import Estimates, identify, identify_recording, in_windows, prepare
+from jaximp.identification.regression import Filters, design_filters, noise_of_rows, regress, undisturbed
+from jaximp.jobs.job import FilterSettings, Job, parse_job
+from jaximp.least_squares.window import least_squares
 from jaximp.models import (
     HumanJoint,
     Joints,
@@ -31,8 +32,8 @@ from jaximp.models import (
     reflex_gain,
     with_gain,
 )
-from jaximp.recordings import recording_from_arrays
-from jaximp.regression import Filters, design_filters, noise_of_rows, regress, undisturbed
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.reports import estimates as report
 from jaximp.types import Recording
 
 Numbers = NDArray[np.float64]

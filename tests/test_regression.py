@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
-from jaximp.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
+from jaximp.identification.regression import Filters, design_filters, noise_of_rows, regress
+from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
 from jaximp.models import Model
-from jaximp.recordings import recording_from_arrays
-from jaximp.regression import Filters, design_filters, noise_of_rows, regress
-from jaximp.signals import central_differences
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.signals.filters import central_differences
 from jaximp.types import Recording
 
 RATE = 1000.0

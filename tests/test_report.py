@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from test_plots import JOB, identified, recording, without_trust
 
-from jaximp import report
-from jaximp.identify import Estimates
-from jaximp.job import Job, parse_job
+from jaximp.identification.identify import Estimates
+from jaximp.jobs.job import Job, parse_job
+from jaximp.reports import estimates as report
 from jaximp.types import Recording
 
 NASTY = "<script>alert(1)</script>"

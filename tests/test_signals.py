@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
-from jaximp.signals import (
+from jaximp.signals.filters import (
     autocovariance,
     butterworth,
     central_differences,

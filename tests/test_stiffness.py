@@ -14,7 +14,14 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaximp
-from jaximp.stiffness import DAMPING, REASONS, fit_triangles, fit_triangles_linear, merge_triangles, residual_triangle
+from jaximp.perturbation.stiffness import (
+    DAMPING,
+    REASONS,
+    fit_triangles,
+    fit_triangles_linear,
+    merge_triangles,
+    residual_triangle,
+)
 
 Numbers = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaximp.isolation import in_window
+from jaximp.papers import borner2020, lakatos2011, tout2023
+from jaximp.papers.arm_experiments import Case, as_matrix, replayed_torque, run_case
+from jaximp.perturbation.isolation import in_window
 from jaximp.simulation.neuromuscular import NeuromuscularArm
-from jaximp.studies import borner2020, lakatos2011, tout2023
-from jaximp.studies.arm_experiments import Case, as_matrix, replayed_torque, run_case
 
 
 def test_tout2023_is_reproduced(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_simpson
 
+from jaximp.motion.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 from jaximp.simulation.rig import GRAVITY, HUMAN_TRAJECTORY, ROBOT_TRAJECTORY
-from jaximp.trajectories import FourierSeries, MinimumJerk, RaisedSine, SixthOrder, at_rest, jerk
 
 SERIES = FourierSeries(sine=[0.4, -1.2, 0.3], cosine=[0.7, 0.1, -0.5], offset=0.2, period=4.0)
 TWO_SERIES = FourierSeries(

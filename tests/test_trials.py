@@ -12,12 +12,20 @@ import numpy as np
 import pytest
 
 from jaximp import load_recording, recording_from_arrays, save_recording
-from jaximp.job import FilterSettings
-from jaximp.least_squares import WindowFit
+from jaximp.jobs.job import FilterSettings
+from jaximp.least_squares.window import WindowFit
 from jaximp.models import ArmGeometry, PlanarArm
+from jaximp.perturbation.trials import (
+    Trials,
+    fit_trials,
+    joint_trials,
+    load_trials,
+    predict_trials,
+    read_trials,
+    regress_trials,
+)
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
-from jaximp.trials import Trials, fit_trials, joint_trials, load_trials, predict_trials, read_trials, regress_trials
-from jaximp.trust import TrustLimits, confidence
+from jaximp.trust.verdicts import TrustLimits, confidence
 from jaximp.types import Recording
 
 RATE = 1000.0

@@ -10,11 +10,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.identify import Estimates, identify_recording
-from jaximp.job import parse_job
-from jaximp.recordings import recording_from_arrays
-from jaximp.trust import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK, TrustLimits, fake_change_threshold, judge
-from jaximp.windows import SlidingFit, sliding_least_squares
+from jaximp.identification.identify import Estimates, identify_recording
+from jaximp.jobs.job import parse_job
+from jaximp.least_squares.sliding import SlidingFit, sliding_least_squares
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.trust.verdicts import (
+    FAKE,
+    NO_DATA,
+    POOR,
+    TRUSTED,
+    VERDICTS,
+    WEAK,
+    TrustLimits,
+    fake_change_threshold,
+    judge,
+)
 
 Numbers = NDArray[np.float64]
 

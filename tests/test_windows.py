@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.least_squares import Fit, SlidingFit, WindowFit, least_squares
-from jaximp.windows import score, sliding_least_squares, sliding_theta, window_starts
+from jaximp.least_squares.sliding import score, sliding_least_squares, sliding_theta, window_starts
+from jaximp.least_squares.window import Fit, SlidingFit, WindowFit, least_squares
 
 Numbers = NDArray[np.float64]
 THETA = np.array([0.1, 1.5, 20.0])

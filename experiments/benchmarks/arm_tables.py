@@ -19,9 +19,9 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
+from jaximp.papers.arm_experiments import Case, run_case  # noqa: E402
+from jaximp.papers.borner2020 import AT_ONCE, SIMULATIONS, run  # noqa: E402
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm  # noqa: E402
-from jaximp.studies.arm_experiments import Case, run_case  # noqa: E402
-from jaximp.studies.borner2020 import AT_ONCE, SIMULATIONS, run  # noqa: E402
 
 COMPARED = ("feedback_jerk", "gomi_kawato")
 RESULTS = Path(__file__).parents[1] / "results"

@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from jaximp.identify import identify_recording, regress_both
-from jaximp.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
-from jaximp.payload import fit_robot
-from jaximp.regression import design_filters, noise_of_rows
+from jaximp.identification.identify import identify_recording, regress_both
+from jaximp.identification.regression import design_filters, noise_of_rows
+from jaximp.identification.separation import fit_robot
+from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
+from jaximp.least_squares.sliding import sliding_theta
 from jaximp.simulation.rig import HumanLoad
-from jaximp.studies.rig_recordings import rig_recordings
+from jaximp.simulation.rig_recordings import rig_recordings
 from jaximp.types import Recording
-from jaximp.windows import sliding_theta
 
 jax.config.update("jax_enable_x64", True)
 

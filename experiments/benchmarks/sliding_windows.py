@@ -45,7 +45,7 @@ def ours(what: str, n: int, p: int, window: int, repeats: int = 5) -> dict[str, 
 
     jax.config.update("jax_enable_x64", True)
     import jaximp
-    from jaximp.signals import autocovariance, butterworth
+    from jaximp.signals.filters import autocovariance, butterworth
 
     W, y = data(n, p)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -138,7 +138,7 @@ def streaming(p: int) -> dict[str, float]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaximp import recursive
+    from jaximp.least_squares import recursive
 
     W, y = data(20_000, p)
     step, state, times = jax.jit(recursive.step), recursive.init(p), []

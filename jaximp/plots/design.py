@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaximp.excitation import Design
+from jaximp.design.excitation import Design
+from jaximp.motion.trajectories import FourierSeries
 from jaximp.plots.style import BLACK, LINES, WIDTH, draw_line, styled
-from jaximp.trajectories import FourierSeries
 
 UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from jaximp.identify import Estimates
-from jaximp.least_squares import confidence_interval
+from jaximp.identification.identify import Estimates
+from jaximp.identification.separation import METHODS
+from jaximp.least_squares.window import confidence_interval
 from jaximp.models.joint import parameter_units
-from jaximp.payload import METHODS
 from jaximp.plots.style import (
     BLACK,
     BLUE,
@@ -38,7 +38,7 @@ from jaximp.plots.style import (
     styled,
     with_unit,
 )
-from jaximp.trust import FAKE, NO_DATA, POOR, VERDICTS, WEAK
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, VERDICTS, WEAK
 
 STRETCHES = 1000
 """Shaded stretches are drawn no finer than this share of the axis."""

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaximp.impedance import ArmImpedance, OtherWindows
-from jaximp.isolation import METHODS
-from jaximp.movements import VOLUNTARY_DELAY
+from jaximp.perturbation.impedance import ArmImpedance, OtherWindows
+from jaximp.perturbation.isolation import METHODS
+from jaximp.perturbation.movements import VOLUNTARY_DELAY
 from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, pretty_unit, styled
 from jaximp.types import Numbers
 

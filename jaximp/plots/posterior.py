@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from jaximp.plots.style import BLACK, BLUE, VERMILLION, WIDTH, cycle, draw_band, draw_line, pretty_unit, styled, words
 from jaximp.plots.style import LINES as STYLES
-from jaximp.posterior import Posterior, PosteriorMany, index_of
+from jaximp.posterior.draws import Posterior, PosteriorMany, index_of
 from jaximp.types import AnyArray, Numbers
 
 BANDS = (0.95, 0.5)

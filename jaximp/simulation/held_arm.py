@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 
 from jaximp.models import ArmGeometry, mass_matrix, rigid_body_torque, solve_pair
-from jaximp.trajectories import MinimumJerk, array_field
+from jaximp.motion.trajectories import MinimumJerk, array_field
 from jaximp.types import AnyArray
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, -1], [-1, 1]]) * 0.05

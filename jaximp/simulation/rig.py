@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaximp.trajectories import FourierSeries, array_field
+from jaximp.motion.trajectories import FourierSeries, array_field
 from jaximp.types import Recording
 
 GRAVITY = 9.81

@@ -1,0 +1,1 @@
+"""Many recordings by one job: plan, run, results, overview."""

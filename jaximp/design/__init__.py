@@ -1,0 +1,1 @@
+"""Motions that excite a model, found by gradient within limits."""

@@ -1,0 +1,258 @@
+"""A look at the data before a run: what was recorded, what is wrong with it, and which filters and window suit it."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.identification.identify import Estimates, identify_recording, jump_note
+from jaximp.identification.regression import design_filters, jumped, regress
+from jaximp.jobs.job import Job
+from jaximp.models import combine
+from jaximp.signals import filters as signals
+from jaximp.trust.verdicts import NEGATIVE, NO_DATA, WEAK
+from jaximp.types import Progress, Recording
+
+GOOD, LOOK, BAD = "ok", "look", "bad"
+FEWEST = 100
+"""Samples that spectra can be made of."""
+SLOWEST = 20.0
+"""A joint's impedance cannot be seen below this sample rate [Hz]."""
+WIDEST = 2 * np.pi
+"""No human joint turns further than this [rad]."""
+LONGEST_DELAY = 0.03
+"""Delays between torque and position are sought up to this long [s]."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was checked."""
+
+    topic: str
+    verdict: str
+    """`ok`, `look` (may matter) or `bad` (will spoil the estimates)."""
+    text: str
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Settings that suit the recording, for a job file."""
+
+    position_cutoff: float
+    """[Hz]"""
+    decimation_cutoff: float
+    """[Hz]"""
+    window: float | None
+    """[s]; None where no length that was tried excites the model."""
+    why: str
+
+
+def check_recording(
+    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+) -> tuple[list[Finding], Proposal]:
+    """Check a recording for the model of a job, and propose cut-offs and a window."""
+    if len(recording) < FEWEST:
+        raise ValueError(f"the recording has {len(recording)} samples: at least {FEWEST} are needed to check it")
+    findings = [_sampling(recording), _gaps(recording)]
+    for channel, values in (("position", recording.position), ("torque", recording.torque)):
+        for joint in range(recording.n_joints):
+            label = channel if recording.n_joints == 1 else f"{channel} {joint + 1}"
+            column = values[:, joint]
+            findings += [_saturation(label, column), _resolution(label, column)]
+            if channel == "position":
+                findings += _range(label, recording.joints[joint], column)
+    progress(0.1)
+    bandwidth = coherent_bandwidth(recording)
+    position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
+    filters = replace(job.filter, position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff, decimate=None)
+    findings.append(
+        Finding(
+            "bandwidth",
+            GOOD,
+            f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
+        )
+    )
+    findings.append(_delay(replace(job, filter=filters), recording))
+    progress(0.3)
+    window, of_windows = _window(replace(job, filter=filters), recording, alone, progress)
+    why = (
+        "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that; "
+        "the window that predicts the next one best: a longer one is more precise, a shorter one follows changes sooner"
+    )
+    return [*findings, *of_windows], Proposal(position_cutoff, decimation_cutoff, window, why)
+
+
+def coherent_bandwidth(recording: Recording) -> float:
+    """Frequency [Hz] up to which some joint's position and torque share four fifths of their variance.
+
+    At least five times the frequency below which 95 % of the position's power lies: a motion of a few lines is coherent
+    at those alone.
+    """
+    from scipy.signal import coherence, welch
+
+    q, torque = (signals.fill_gaps(x, recording.valid) for x in (recording.position, recording.torque))
+    rate = recording.sample_rate
+    n = int(min(len(recording) // 4, max(256, 8 * rate)))
+    frequency, shared = coherence(np.diff(q, axis=0), torque[1:], fs=rate, nperseg=n, axis=0)
+    smooth = np.convolve(np.nan_to_num(shared).max(axis=1), np.ones(5) / 5, mode="same")
+    together = smooth[1:] > 0.8
+    # Only the first stretch counts: hum far above the motion is coherent as well.
+    first = int(np.argmax(together))
+    length = int(np.argmin(np.r_[together[first:], False]))
+    power = np.cumsum(welch(q, fs=rate, nperseg=n, axis=0)[1].sum(axis=1))
+    slow = frequency[int(np.searchsorted(power, 0.95 * power[-1]))]
+    return float(max(frequency[max(1, first + length)], 5 * slow))
+
+
+def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
+    """Delay of the torque behind the position [s] at which the model fits best, and whether the data determine it."""
+    robot, human = job.models(recording.joints, recording.sample_rate)
+    model = human if robot is None else robot if human is None else combine(robot, human)
+    assert model is not None
+    undecimated = replace(job, filter=replace(job.filter, decimate=1, mode="once"))
+    rows = regress(model, recording, undecimated, design_filters(undecimated.filter, recording.sample_rate))
+    W, torque = (np.asarray(x).reshape(len(rows.time), recording.n_joints, -1) for x in (rows.W, rows.torque))
+    usable = np.atleast_1d(np.asarray(rows.valid).reshape(len(rows.time), -1).all(axis=1))
+    reach = max(3, round(LONGEST_DELAY * recording.sample_rate))
+    first, last = (np.flatnonzero(usable)[[0, -1]] + [reach, -reach]).tolist()
+    inner = slice(first, last + 1)
+    if last - first < 10 * W.shape[-1] or not usable[inner].any():
+        return 0.0, False
+    keep = usable[inner]
+    Q = np.linalg.qr(W[inner][keep].reshape(-1, W.shape[-1]))[0]
+    unexplained = []
+    for shift in range(-reach, reach + 1):
+        y = torque[first + shift : last + 1 + shift][keep].reshape(-1)
+        unexplained.append((y @ y - (Q.T @ y) @ (Q.T @ y)) / (y @ y))
+    best = int(np.argmin(unexplained))
+    if best in (0, len(unexplained) - 1):
+        return (best - reach) / recording.sample_rate, False
+    before, here, after = unexplained[best - 1 : best + 2]
+    sharp = before - 2 * here + after
+    offset = 0.5 * (before - after) / sharp if sharp > 0 else 0.0
+    # A flat minimum says nothing: two samples beside it must fit visibly worse.
+    determined = min(unexplained[max(best - 2, 0)], unexplained[min(best + 2, 2 * reach)]) > 1.001 * here
+    return float((best - reach + offset) / recording.sample_rate), bool(determined)
+
+
+def _sampling(recording: Recording) -> Finding:
+    text = f"{len(recording)} samples at {recording.sample_rate:.6g} Hz, {len(recording) / recording.sample_rate:.4g} s"
+    if recording.sample_rate < SLOWEST:
+        return Finding("sampling", BAD, f"{text}: too slow for a joint; is the time's unit right (ms?)")
+    return Finding("sampling", LOOK if recording.notes else GOOD, "; ".join([text, *recording.notes]))
+
+
+def _range(label: str, joint: str, x: NDArray[np.float64]) -> list[Finding]:
+    """A joint that turns around several times was probably written down in degrees."""
+    span = float(np.nanmax(x) - np.nanmin(x))
+    if joint != "revolute" or span < WIDEST:
+        return []
+    return [Finding(f"{label}: range", LOOK, f"{span:.3g} rad: is it the motor's angle, or should unit be 'deg'?")]
+
+
+def _gaps(recording: Recording) -> Finding:
+    missing = 1 - recording.valid.mean()
+    text = [f"{missing:.2%} of the samples are missing" if missing else "none", jump_note(recording, jumped(recording))]
+    verdict = BAD if missing > 0.05 else LOOK if missing or text[1] else GOOD
+    return Finding("gaps", verdict, "; ".join(filter(None, text)))
+
+
+def _saturation(label: str, x: NDArray[np.float64]) -> Finding:
+    """A signal that stays at its extreme much longer than just beside it has probably hit a limit."""
+    x = x[np.isfinite(x)]
+    beside = max(4 * signals.quantisation_step(x), 1e-3 * np.ptp(x))
+    for extreme in (x.min(), x.max()):
+        at = _longest_run(x == extreme)
+        # A smooth turning point of a coarse encoder spends as long again on the steps beside its extreme.
+        near = _longest_run(np.abs(x - extreme) <= beside)
+        if at >= 5 and near < 1.5 * at:
+            text = f"{at} samples in a row at {extreme:.4g}, the end of the range: was a limit hit?"
+            return Finding(f"{label}: saturation", LOOK, text)
+    return Finding(f"{label}: saturation", GOOD, "none seen")
+
+
+def _longest_run(mask: NDArray[np.bool_]) -> int:
+    edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0]))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _resolution(label: str, x: NDArray[np.float64]) -> Finding:
+    """Step of the encoder or converter, and noise, against the signal's range."""
+    noise, step, span = signals.noise_level(x), signals.quantisation_step(x), float(np.nanmax(x) - np.nanmin(x))
+    text = f"noise {noise:.2g} ({noise / span:.1e} of the range)"
+    text += f", step {step:.4g}" if step else ", no step visible"
+    return Finding(f"{label}: noise", LOOK if noise > 0.05 * span else GOOD, text)
+
+
+def _cutoffs(bandwidth: float, recording: Recording) -> tuple[float, float]:
+    """Position and parallel cut-off [Hz], two digits, below a quarter and an eighth of the sample rate."""
+    decimation = min(bandwidth, recording.sample_rate / 8)
+    position = min(2 * decimation, recording.sample_rate / 4)
+    return float(f"{position:.2g}"), float(f"{decimation:.2g}")
+
+
+def _delay(job: Job, recording: Recording) -> Finding:
+    delay, determined = estimate_delay(job, recording)
+    if not determined:
+        return Finding("delay", GOOD, "the data do not determine a delay between torque and position")
+    text = f"the model fits best if torque lags position by {1e3 * delay:.2f} ms"
+    if abs(delay) < 0.5 / recording.sample_rate:
+        return Finding("delay", GOOD, f"{text}, within half a sample")
+    return Finding(
+        "delay",
+        LOOK,
+        f"{text} ({delay * recording.sample_rate:.1f} samples): if the recorder did this, shift the torque beforehand",
+    )
+
+
+def _window(
+    job: Job, recording: Recording, alone: Recording | None, progress: Progress
+) -> tuple[float | None, list[Finding]]:
+    """Of a few lengths in which nine windows of ten are excited, the one that predicts the next window best."""
+    duration = len(recording) / recording.sample_rate
+    tried = [length for length in (0.5, 1.0, 2.0, 5.0, 10.0) if length <= duration / 3]
+    seen, good, signs = [], {}, []
+    for count, length in enumerate(tried):
+        estimates = _trial(job, recording, alone, length)
+        progress(0.3 + 0.7 * (count + 1) / len(tried))
+        if estimates is None:
+            continue
+        verdict = estimates.verdicts.verdict
+        with_data = verdict != NO_DATA
+        share = float((verdict[with_data] != WEAK).mean()) if with_data.any() else 0.0
+        signs.append(np.char.find(estimates.verdicts.reason[with_data], NEGATIVE) >= 0)
+        seen.append(f"{length:g} s {share:.0%}")
+        if share >= 0.9:
+            good[length] = float(np.nanmean(estimates.held_out_vaf[with_data]))
+    return max(good, key=lambda length: good[length], default=None), [
+        _excitation(seen, good),
+        *([_sign()] if signs and np.mean(np.concatenate(signs)) > 0.5 else []),
+    ]
+
+
+def _trial(job: Job, recording: Recording, alone: Recording | None, length: float) -> Estimates | None:
+    """Estimates with windows of one length; None where it cannot be tried."""
+    step = max(length / 10, len(recording) / recording.sample_rate / 200)
+    trial = replace(
+        job,
+        window=replace(job.window, length=length, step=step),
+        model=replace(job.model, methods=job.model.methods[:1]),
+    )
+    with suppress(ValueError):
+        return identify_recording(trial, recording, alone)[0]
+    return None
+
+
+def _excitation(seen: list[str], good: dict[float, float]) -> Finding:
+    if good:
+        held_out = ", ".join(f"{length:g} s {vaf:.0%}" for length, vaf in good.items())
+        return Finding("excitation", GOOD, f"variance explained in the next, unseen window: {held_out}")
+    text = "windows that are excited: " + (", ".join(seen) if seen else "none could be tried")
+    return Finding("excitation", BAD, f"{text}: the motion does not excite this model, or the model is too large")
+
+
+def _sign() -> Finding:
+    return Finding("torque: sign", BAD, "the inertia comes out negative: set sign = -1 for the torque")

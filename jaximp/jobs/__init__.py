@@ -1,0 +1,1 @@
+"""Job files: the only part that knows TOML."""

@@ -1,0 +1,416 @@
+"""The job file: what to identify, from which recording, with which filters and windows.
+
+A job is TOML. `read_job` checks every key and value and names the nearest known key where one is misspelt.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from jaximp.design.files import read_trajectory
+from jaximp.identification.separation import METHODS
+from jaximp.jobs.settings import check_keys, checked, optional, read, settings
+from jaximp.jobs.trials import HandArmSettings, TrialsSettings, arm_settings, trials_settings
+from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
+from jaximp.motion.trajectories import FourierSeries
+from jaximp.posterior.priors import LogNormal, Normal
+from jaximp.recordings.load import recording_from_mapping
+from jaximp.trust.verdicts import TrustLimits
+from jaximp.types import Recording
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Filters of Tout et al. 2023, III-B; all are Butterworth filters run forward and backward."""
+
+    position_cutoff: float | None = None
+    """Low-pass of the position before it is differentiated [Hz]; the paper's f_c, above ten natural frequencies. The
+    torque does not pass it, so whatever it takes off the motion biases the estimates: leave room above the motion."""
+    position_order: int = 8
+    decimation_cutoff: float | None = None
+    """Low-pass of the torque and of every column of the regressor [Hz]; the paper's f_cd, above two natural
+    frequencies."""
+    decimation_order: int = 4
+    high_pass: float | None = None
+    """High-pass of the torque and of every column [Hz], which takes slow drift out of both sides."""
+    high_pass_order: int = 2
+    decimate: int | None = None
+    """Keep every n-th sample after the filters; by default five samples per period of `decimation_cutoff`."""
+    mode: str = "once"
+    """`once` filters the recording and then slides; `window` filters inside every window, as the paper writes."""
+    drop_transient: bool = True
+    """With `mode = "window"`: leave out the rows at both ends of the window that its edges disturb. Kept, they biased
+    the inertia by 2.2 standard deviations on the simulated rig; left out, by 0.1 (experiments/coverage.py)."""
+    measured_derivatives: bool = False
+    """Use the recording's velocity (and acceleration, where it has one) in place of differences of the position."""
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Windows and the samples that count in them."""
+
+    length: float
+    """Length of the sliding window [s]."""
+    step: float | None = None
+    """From one window to the next [s]; by default a fiftieth of the length."""
+    min_velocity: float = 0.0
+    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """Columns of `models.RobotJoint`."""
+
+    gear_ratio: float = 1.0
+    gravity: bool | None = None
+    viscous: bool = True
+    coulomb: bool = True
+    inertia: bool = True
+    offset: bool = False
+    g: float = 9.81
+
+    def make(self, sample_rate: float | None = None, joint: str = "revolute") -> RobotJoint:
+        """The model; it does not depend on the sample rate."""
+        return RobotJoint(**vars(self), joint=joint)
+
+
+@dataclass(frozen=True)
+class ReflexSettings:
+    """Lags of `models.ReflexPathway`, evenly spread; `reflex = true` takes these."""
+
+    first: float = 0.04
+    """Shortest lag [s]: the delay of the reflex, at the most."""
+    last: float = 0.49
+    """Longest lag [s], by which the reflex should have ended."""
+    count: int = 31
+    """How many. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart; twice as far
+    apart they miss what is between, and every estimate is biased."""
+    direction: int = 1
+    """1 where a velocity above zero stretches the muscle, else -1."""
+
+    def lags(self) -> list[float]:
+        """[s]."""
+        if self.count < 1:
+            raise ValueError(f"count is {self.count}: give at least one lag")
+        step = (self.last - self.first) / max(1, self.count - 1)
+        return [round(self.first + k * step, 9) for k in range(self.count)]
+
+
+@dataclass(frozen=True)
+class HumanSettings:
+    """Columns of `models.HumanJoint`."""
+
+    offset: bool = True
+    gear_ratio: float = 1.0
+    reflex: bool | ReflexSettings = False
+    """`true`, or a table with some of the settings: the stretch reflex."""
+
+    def make(self, sample_rate: float | None = None, joint: str = "revolute") -> HumanJoint:
+        """The model, for recordings of a sample rate [Hz], which only a reflex needs."""
+        reflex = ReflexSettings() if self.reflex is True else self.reflex
+        if not reflex:
+            return HumanJoint(self.offset, self.gear_ratio, joint)
+        if sample_rate is None:
+            raise ValueError("a reflex needs the sample rate of the recording: pass models(joints, sample_rate)")
+        try:
+            pathway = ReflexPathway(sample_rate, reflex.lags(), reflex.direction)
+        except ValueError as error:
+            raise ValueError(f"model.human.reflex: {error}") from None
+        return HumanJoint(self.offset, self.gear_ratio, joint, pathway)
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Columns of `models.PlanarArm`: two joints that share their parameters."""
+
+    equilibrium: list[float] | None = None
+    """Two angles [rad]; damping and stiffness about them are identified where it is given."""
+    inertia: bool = True
+    gravity: bool = False
+    viscous: bool = False
+    coulomb: bool = False
+    offset: bool = False
+    rotor: bool = False
+    """The inertia of the second motor's rotor behind its gear."""
+    g: float = 9.81
+    zero: str = "horizontal"
+    """Where gravity acts: at angles of zero the arm is `horizontal`, or `hanging`."""
+    length: float | None = None
+    """Of the upper arm [m]: ties inertia to gravity."""
+
+    def make(self) -> PlanarArm:
+        """The model."""
+        return PlanarArm(**vars(self), impedance=self.equilibrium is not None)
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """What is identified: a human joint, a robot joint, or the human in the robot by some of the four methods; or an
+    arm of two joints."""
+
+    human: HumanSettings | None = None
+    robot: RobotSettings | None = None
+    arm: ArmSettings | None = None
+    hand_arm: HandArmSettings | None = None
+    """`[model.arm]` of a job with `[trials]`."""
+    methods: tuple[int, ...] = (1,)
+    """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
+
+
+@dataclass(frozen=True)
+class PosteriorSettings:
+    """`[posterior]`: what posteriors are drawn with."""
+
+    seed: int = 0
+    ess: float = 1000.0
+    """Effective samples of every parameter."""
+    heavy_tails: bool = False
+    """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
+    prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)
+    """Of parameters by name: `{ mean = 60, sd = 20 }`, or `{ median = 0.7, factor = 2 }` of one that is positive."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that `identify` needs to know."""
+
+    recording: Mapping[str, Any]
+    """The `[recording]` table: keywords of `load_recording`, and `file`."""
+    model: ModelSettings
+    window: WindowSettings
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    trust: TrustLimits = field(default_factory=TrustLimits)
+    robot_recording: Mapping[str, Any] | None = None
+    """The recording of the robot alone, for the four methods."""
+    reference_period: float | None = None
+    """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
+    design: str | None = None
+    """The trajectory.json of the design that the motion followed: it serves in place of both."""
+    posterior: PosteriorSettings = field(default_factory=PosteriorSettings)
+    folder: Path = Path()
+    """Where relative file names start."""
+    trials: TrialsSettings | None = None
+    """In place of a recording: perturbation trials of an arm."""
+    text: str = ""
+    """The job file as written."""
+
+    def load(self) -> Recording:
+        """The recording to be identified.
+
+        **Raises:** `ValueError` for a job with trials, which `trials.load` reads, and as `load_recording`.
+        """
+        if self.trials is not None:
+            raise ValueError("this job has [trials] and no [recording]: read them by its trials.load()")
+        return recording_from_mapping(self.recording, self.folder)
+
+    def load_robot_alone(self) -> Recording | None:
+        """The recording of the robot alone, where the job has one."""
+        return None if self.robot_recording is None else recording_from_mapping(self.robot_recording, self.folder)
+
+    def load_design(self) -> FourierSeries | None:
+        """The motion that was designed, where the job names one."""
+        return None if self.design is None else read_trajectory(self.folder / self.design)
+
+    def files(self) -> list[Path]:
+        """What the job reads."""
+        tables = (self.recording, self.robot_recording or {})
+        names = [str(table["file"]) for table in tables if "file" in table]
+        trials = [path for table in self.tables_of_trials() for path in table.paths()]
+        return [*(self.folder / name for name in (*names, self.design) if name is not None), *trials]
+
+    def tables_of_trials(self) -> list[TrialsSettings]:
+        """`[trials]` and `[trials.posture]`, as far as the job has them."""
+        tables = (self.trials, self.trials and self.trials.posture)
+        return [table for table in tables if table is not None]
+
+    def models(self, joints: tuple[str, ...], sample_rate: float | None = None) -> tuple[Model | None, Model | None]:
+        """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
+        one model of two joints, stands in the robot's place. A human with a reflex needs the `sample_rate` [Hz]."""
+        robot, human = self.model.robot, self.model.human
+        if self.model.arm is not None:
+            if joints != ("revolute", "revolute"):
+                raise ValueError(
+                    f"model.arm has two revolute joints, but the recording {' and '.join(joints)}: map two columns of "
+                    "the position and two of the torque"
+                )
+            return self.model.arm.make(), None
+        return _side_by_side(robot, joints, sample_rate), _side_by_side(human, joints, sample_rate)
+
+
+@lru_cache(maxsize=64)
+def _side_by_side(
+    one: RobotSettings | HumanSettings | None, joints: tuple[str, ...], sample_rate: float | None
+) -> Model | None:
+    """The model of one joint or several, if there is one; thousands of recordings share it."""
+    if one is None:
+        return None
+    models = [one.make(sample_rate, joint) for joint in joints]
+    return models[0] if len(models) == 1 else Joints(*models)
+
+
+def read_job(path: str | Path) -> Job:
+    """Read and check a job file.
+
+    **Raises:** `ValueError` with one line that names the key and the remedy.
+    """
+    return read(path, parse_job)
+
+
+def parse_job(text: str, folder: Path = Path()) -> Job:
+    """A job from TOML text; relative file names start at `folder`."""
+    tables = tomllib.loads(text)
+    known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period", "design"]
+    check_keys(tables, [*known, "posterior", "trials"], "the job")
+    if "trials" in tables:
+        return _job_of_trials(tables, folder, text)
+    for required in ("recording", "model", "window"):
+        if required not in tables:
+            raise ValueError(f"the job has no [{required}] table: add one")
+    for table in ("recording", "robot_recording"):
+        if table in tables and not isinstance(tables[table], dict):
+            raise ValueError(f"[{table}] must be a table")
+    job = Job(
+        recording=tables["recording"],
+        robot_recording=tables.get("robot_recording"),
+        model=model_settings(tables["model"]),
+        window=settings(WindowSettings, tables["window"], "window"),
+        filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
+        trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
+        reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
+        design=checked(tables.get("design"), str | None, "design"),
+        posterior=posterior_settings(tables.get("posterior", {})),
+        folder=folder,
+        text=text,
+    )
+    _check_values(job)
+    return job
+
+
+def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
+    """A job whose trials stand in place of a recording, its filters and its windows."""
+    for other in tables:
+        if other not in ("trials", "model", "trust", "posterior"):
+            raise ValueError(
+                f"[trials] stand in place of a recording and have a window of their own: leave out '{other}'"
+            )
+    model = tables.get("model", {})
+    if not isinstance(model, dict) or "arm" not in model:
+        raise ValueError("[trials] are those of an arm: add [model.arm] with its lengths")
+    check_keys(model, ["arm"], "[model] beside [trials]")
+    arm = arm_settings(model["arm"])
+    trials = trials_settings(tables["trials"], folder, arm.geometry())
+    if arm.inertia is not None and trials.posture is not None:
+        raise ValueError("model.arm.inertia and [trials.posture] both give the arm's inertia: keep one of them")
+    trust = settings(TrustLimits, tables.get("trust", {}), "trust")
+    _check_limits(trust)
+    window = WindowSettings(trials.window)
+    posterior = posterior_settings(tables.get("posterior", {}))
+    if posterior.prior:
+        raise ValueError("[posterior.prior] is for jobs with a recording: an arm's impedance has none")
+    model_of_arm = ModelSettings(hand_arm=arm)
+    return Job({}, model_of_arm, window, trust=trust, posterior=posterior, trials=trials, folder=folder, text=text)
+
+
+def posterior_settings(table: Any) -> PosteriorSettings:
+    """`[posterior]`, with every key and value checked."""
+    if not isinstance(table, dict) or not isinstance(table.get("prior", {}), dict):
+        raise ValueError("[posterior] and [posterior.prior] must be tables")
+    check_keys(table, list(PosteriorSettings.__dataclass_fields__), "[posterior]")
+    prior: dict[str, Normal | LogNormal] = {}
+    for name, one in table.get("prior", {}).items():
+        where = f"posterior.prior.{name}"
+        log_normal = isinstance(one, dict) and "median" in one
+        prior[name] = settings(LogNormal, one, where) if log_normal else settings(Normal, one, where)
+    plain = settings(PosteriorSettings, {key: value for key, value in table.items() if key != "prior"}, "posterior")
+    if not (400 <= plain.ess <= 1e6):
+        raise ValueError(f"posterior.ess is {plain.ess:g}: ask for 400 to 1e6 effective samples")
+    return replace(plain, prior=prior)
+
+
+def model_settings(table: Any) -> ModelSettings:
+    if not isinstance(table, dict):
+        raise ValueError("[model] must be a table")
+    check_keys(table, ["human", "robot", "arm", "methods"], "[model]")
+    robot = optional(RobotSettings, table.get("robot", False), "model.robot")
+    human = optional(HumanSettings, table.get("human", False), "model.human")
+    arm = optional(ArmSettings, table.get("arm", False), "model.arm")
+    if arm is not None:
+        if robot is not None or human is not None:
+            raise ValueError("model.arm stands alone: leave out model.robot and model.human")
+        arm.make()  # refuses what does not go together
+        if "methods" in table:
+            raise ValueError("model.methods tell a human from a robot on one joint: leave them out beside model.arm")
+    methods = table.get("methods", [1])
+    methods = methods if isinstance(methods, list) else [methods]
+    if not methods or any(type(method) is not int or method not in METHODS for method in methods):
+        raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
+    return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)))
+
+
+def _check_values(job: Job) -> None:
+    if job.model.human is None and job.model.robot is None and job.model.arm is None:
+        raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
+    both = job.model.human is not None and job.model.robot is not None
+    if both and job.robot_recording is None:
+        raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
+    if not both and job.robot_recording is not None:
+        raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
+    if job.model.human is not None:
+        job.model.human.make(1000.0)  # refuses lags that make no sense
+        if job.model.human.reflex and job.filter.mode == "window":
+            raise ValueError("filter.mode = 'window' cuts off the past that a reflex answers to: set it to 'once'")
+    if job.filter.mode not in ("once", "window"):
+        raise ValueError(f"filter.mode is '{job.filter.mode}': it must be 'once' or 'window'")
+    positive = {
+        "window.length": job.window.length,
+        "window.step": job.window.step,
+        "filter.decimate": job.filter.decimate,
+        "filter.position_cutoff": job.filter.position_cutoff,
+        "filter.decimation_cutoff": job.filter.decimation_cutoff,
+        "filter.high_pass": job.filter.high_pass,
+        "reference_period": job.reference_period,
+    }
+    for name, value in positive.items():
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} is {value}: it must be a number above zero")
+    if not (job.window.min_velocity >= 0 and math.isfinite(job.window.min_velocity)):
+        raise ValueError(f"window.min_velocity is {job.window.min_velocity}: it must be zero or more")
+    _check_limits(job.trust)
+    if job.design is not None and job.reference_period is not None:
+        raise ValueError("design and reference_period both say how long a period is: keep one of them")
+    _check_gears(job)
+    for name in ("position_order", "decimation_order", "high_pass_order"):
+        if not 1 <= getattr(job.filter, name) <= 12:
+            raise ValueError(f"filter.{name} is {getattr(job.filter, name)}: it must lie between 1 and 12")
+    offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm) if part is not None]
+    if job.filter.high_pass is not None and any(offsets):
+        raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
+
+
+def _check_limits(trust: TrustLimits) -> None:
+    for name, value in vars(trust).items():
+        if isinstance(value, float) and not (value >= 0 and math.isfinite(value)):
+            raise ValueError(f"trust.{name} is {value}: it must be zero or more")
+    for name in ("min_vaf", "min_valid_share"):
+        if getattr(trust, name) > 1:
+            raise ValueError(f"trust.{name} is {getattr(trust, name)}: it is a share, between 0 and 1")
+
+
+def _check_gears(job: Job) -> None:
+    """A gear counts once: either when the recording is read, or in the models, and there for both alike."""
+    ratios = {part.gear_ratio for part in (job.model.robot, job.model.human) if part is not None}
+    if len(ratios) > 1:
+        raise ValueError(
+            f"model.robot and model.human have different gear ratios, {sorted(ratios)}: they share one motor"
+        )
+    if ratios != {1.0} and job.recording.get("gear_ratio", 1.0) != 1.0:
+        raise ValueError(
+            "gear_ratio stands both in [recording], which brings the columns to the joint, and in [model], which "
+            "expects them at the motor: keep one of them"
+        )

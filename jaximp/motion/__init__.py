@@ -1,0 +1,1 @@
+"""Reference motions: Fourier series, minimum jerk, perturbations."""

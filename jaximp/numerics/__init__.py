@@ -1,0 +1,1 @@
+"""Small linear algebra and the settings of the compiler, for all that follows."""

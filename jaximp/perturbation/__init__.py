@@ -1,0 +1,1 @@
+"""An arm that is perturbed: trials, isolation of the involuntary answer, damping and stiffness."""

@@ -1,0 +1,1 @@
+"""Recordings: files of many kinds, columns and units, a uniform grid in time."""

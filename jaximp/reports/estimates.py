@@ -1,0 +1,414 @@
+"""Results on disk: the table of windows, the summary, the figures, and one HTML report that says it all.
+
+The report gives the answer first and never a number that no trusted window stands behind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from jaximp import plots
+from jaximp.identification.identify import Estimates, Reflex
+from jaximp.identification.regression import design_filters
+from jaximp.identification.separation import METHODS
+from jaximp.jobs.job import Job
+from jaximp.least_squares.window import confidence_interval
+from jaximp.models import HumanJoint, Joints, Model
+from jaximp.reports.pages import (
+    inline,
+    percent,
+    table_of,
+    template,
+    versions,
+    without_nan,
+    write_figures,
+    write_summary,
+)
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK
+from jaximp.types import Recording
+
+REMEDIES = {
+    TRUSTED: "",
+    WEAK: "Excite the joint more, with larger and faster motion of several frequencies, or lengthen window.length.",
+    FAKE: "Lengthen window.length or use a richer reference trajectory: the motion in these windows is too poor to "
+    "tell a change of the parameters from an artefact.",
+    POOR: "Look at the residual's spectrum, then check the torque's sign and unit, the filters, and whether the model "
+    "lacks something (an offset, friction, gravity, a reflex).",
+    NO_DATA: "Record without gaps, lower window.min_velocity, or lengthen window.length; windows at the very ends of "
+    "the recording are lost to the filters.",
+}
+"""What to do about windows with a verdict, in one sentence."""
+
+CAPTIONS = {
+    "parameters": "Each estimate is an average over its window, drawn at the window's end: a steady change appears "
+    "half a window late. The interval holds the truth with probability 95 % if model and noise are as assumed and "
+    "nothing changes inside the window. Shaded stretches must not be believed.",
+    "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
+    "each sample (fitted), and with those of a window that had not seen it (held out).",
+    "condition": "A large condition number or a small singular value means that the motion does not tell the "
+    "parameters apart. Where the held-out VAF falls below the other, the parameters change or fit noise.",
+    "residual_spectrum": "What the model leaves over, by frequency. A peak that the torque has as well is something "
+    "that the model lacks; a flat floor is noise.",
+    "reflex": "What a stretch does to the torque as time goes by: the weight of every lag of the rectified velocity. "
+    "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
+    "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "
+    "spread well above the standard error is a true change, or something that the model lacks.",
+    "methods": "The same windows by several methods of telling the human from the robot.",
+}
+"""Figures in the order of the report, and how to read them."""
+
+
+def write_results(
+    folder: str | Path,
+    estimates_list: Sequence[Estimates],
+    lengths: Sequence[Estimates],
+    job: Job,
+    recording: Recording,
+) -> None:
+    """Write everything into an existing folder.
+
+    `estimates.parquet` (and `estimates_method3.parquet` for a further method 3), `summary.json`, `report.html`, and
+    every figure of the report as a PNG file.
+
+    **Arguments:** `estimates_list` one for each method, the main one first; `lengths` the same data at several window
+    lengths, or nothing.
+    """
+    folder = Path(folder)
+    human = job.models(recording.joints, recording.sample_rate)[1]
+    for k, estimates in enumerate(estimates_list):
+        name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
+        pq.write_table(estimates_table(estimates, human, job), folder / f"{name}.parquet")
+    figures = draw_figures(estimates_list, lengths)
+    write_figures(folder, figures)
+    content = summary(estimates_list, job, recording, lengths)
+    write_summary(folder, content)
+    write_report(folder / "report.html", estimates_list, lengths, job, recording, figures)
+
+
+def draw_figures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) -> dict[str, bytes]:
+    """All figures of a report as PNG files, drawn once for the folder and the page."""
+    main = estimates_list[0]
+    figures = {
+        "parameters": plots.parameters_over_time(main.summarised()),
+        "torque": plots.torque(main),
+        "condition": plots.condition_over_time(main),
+        "residual_spectrum": plots.residual_spectrum(main),
+    }
+    if main.reflexes:
+        figures["reflex"] = plots.reflex_weights(main)
+    if lengths:
+        figures["window_lengths"] = plots.window_lengths(lengths)
+    if len(estimates_list) > 1:
+        figures["methods"] = plots.methods(estimates_list)
+    return {name: plots.png(figure) for name, figure in figures.items()}
+
+
+def write_report(
+    path: str | Path,
+    estimates_list: Sequence[Estimates],
+    lengths: Sequence[Estimates],
+    job: Job,
+    recording: Recording,
+    figures: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write one HTML file that needs no other file, no network and no script.
+
+    **Arguments:** as `write_results`; `figures` PNG files by name, where they are drawn already.
+    """
+    images = draw_figures(estimates_list, lengths) if figures is None else figures
+    content = summary(estimates_list, job, recording, lengths)
+    found = content["windows"]["verdicts"]
+    verdicts = [
+        {"name": name, **found[name], "remedy": REMEDIES[name], "example": _example(estimates_list[0], name)}
+        for name in VERDICTS
+        if found[name]["count"]
+    ]
+    page = template("report.jinja").render(
+        content=content,
+        verdicts=verdicts,
+        notes=_notes(content),
+        main=plots.main_parameter(estimates_list[0].names),
+        figures=inline(images, CAPTIONS),
+        settings=_settings(content),
+    )
+    Path(path).write_text(page, encoding="utf-8")
+
+
+def summary(
+    estimates_list: Sequence[Estimates], job: Job, recording: Recording, lengths: Sequence[Estimates] = ()
+) -> dict[str, Any]:
+    """Everything worth knowing, as plain dictionaries, lists, numbers and text; None where there is no number.
+
+    The main method's results stand at the top level, those of further methods under `further_methods` and those of
+    several window lengths under `window_lengths`, in the same form.
+    """
+    robot, human = job.models(recording.joints, recording.sample_rate)
+    main = estimates_list[0]
+    content = {
+        **_result(main, human),
+        "further_methods": [_result(estimates, human) for estimates in estimates_list[1:]],
+        "window_lengths": [_result(estimates, human) for estimates in lengths],
+        "robot": _robot(main, robot),
+        "recording": {
+            "name": recording.name,
+            "sample_rate_hz": recording.sample_rate,
+            "duration_s": float(recording.time[-1] - recording.time[0]),
+            "samples": len(recording),
+            "valid_share": float(recording.valid.mean()),
+            "joints": list(recording.joints),
+        },
+        "filters": asdict(job.filter) | {"decimate": design_filters(job.filter, recording.sample_rate).decimate},
+        "trust_limits": asdict(job.trust),
+        "min_velocity": job.window.min_velocity,
+        "versions": versions(),
+        "job": job.text,
+    }
+    return without_nan(content)
+
+
+def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | None = None) -> pa.Table:
+    """One row per window. A column's unit is its field's metadata `unit`; the job's text is in the schema's.
+
+    **Arguments:** `human_model` adds the equilibrium position of every human joint with an offset.
+    """
+    fit = estimates.fit
+    theta, stderr = np.asarray(fit.theta), np.asarray(fit.stderr)
+    columns: list[tuple[str, str, Any]] = [("start_s", "s", estimates.start), ("end_s", "s", estimates.end)]
+    for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True)):
+        columns += [(name, unit, theta[:, k]), (f"{name}_stderr", unit, stderr[:, k])]
+    columns += [
+        (f"{part.prefix}equilibrium", part.position_unit, part.equilibrium())
+        for part in _human_parts(estimates, human_model)
+        if part.model.offset
+    ]
+    for reflex in estimates.reflexes:
+        columns += [
+            (f"{reflex.name}_gain", reflex.unit, reflex.gain),
+            (f"{reflex.name}_gain_stderr", reflex.unit, reflex.gain_stderr),
+            (f"{reflex.name}_delay", "s", reflex.delay),
+        ]
+    efforts = {plots.effort(estimates, joint)[1] for joint in range(estimates.torque.shape[1])}
+    columns += [
+        ("condition", "1", fit.cond),
+        ("sigma_min", "mixed", fit.sigma_min),
+        ("residual_rms", efforts.pop() if len(efforts) == 1 else "mixed", fit.residual_rms),
+        ("vaf", "1", fit.vaf),
+        ("held_out_vaf", "1", estimates.held_out_vaf),
+        ("dof", "1", fit.dof),
+        ("samples", "1", fit.samples),
+        ("verdict", "", estimates.verdicts.verdict),
+        ("reason", "", estimates.verdicts.reason),
+    ]
+    return table_of(columns, "" if job is None else job.text)
+
+
+@dataclass(frozen=True)
+class _HumanPart:
+    """One human joint among the parameters of an `Estimates`."""
+
+    model: HumanJoint
+    theta: NDArray[np.float64]
+    """(M, k) the joint's own parameters."""
+    columns: slice
+    """Where they stand among all parameters."""
+    prefix: str
+    """What their names begin with where there are several joints."""
+    position_unit: str
+
+    def equilibrium(self) -> NDArray[np.float64]:
+        """(M,) position at which the elastic torque vanishes."""
+        return np.asarray(self.model.equilibrium(self.theta))
+
+    @property
+    def factor(self) -> NDArray[np.float64]:
+        """(k,) what takes each parameter from the motor's to the joint's side of the gear."""
+        return np.asarray(self.model.at_joint(jnp.ones(self.theta.shape[1])))
+
+
+def _human_parts(estimates: Estimates, human: Model | None) -> list[_HumanPart]:
+    members = () if human is None else human.models if isinstance(human, Joints) else (human,)
+    parts, first = [], 0
+    for model in members:
+        if isinstance(model, HumanJoint):
+            columns = slice(first, first + len(model.names))
+            prefix = estimates.names[first].removesuffix(model.names[0])
+            unit = "rad" if "rad" in model.units[model.names.index("stiffness")] else "m"
+            parts.append(_HumanPart(model, np.asarray(estimates.fit.theta)[:, columns], columns, prefix, unit))
+        first += len(model.names)
+    return parts
+
+
+def _result(estimates: Estimates, human: Model | None) -> dict[str, Any]:
+    """What one method (or one window length) found."""
+    trusted, vaf = estimates.verdicts.trusted, np.asarray(estimates.fit.vaf)
+    parts = _human_parts(estimates, human)
+    step = np.diff(estimates.start)
+    return {
+        "method": estimates.method,
+        "method_description": None if estimates.method is None else METHODS[estimates.method],
+        "window_s": estimates.window,
+        "step_s": float(np.median(step)) if len(step) else None,
+        "parameters": _parameters(estimates, np.ones(len(estimates.names))),
+        "equilibrium": _equilibria(parts, trusted, geared=False),
+        "reflex": {reflex.name: _reflex(reflex, estimates) for reflex in estimates.reflexes},
+        "at_joint": _at_joint(estimates, parts),
+        "windows": {
+            "count": len(trusted),
+            "trusted": int(trusted.sum()),
+            "trusted_share": float(trusted.mean()),
+            "verdicts": {
+                verdict: {"count": count, "share": count / len(trusted)}
+                for verdict, count in estimates.verdicts.counts().items()
+            },
+        },
+        "mean_vaf": _mean(vaf[trusted]),
+        "mean_held_out_vaf": _mean(estimates.held_out_vaf[trusted]),
+        "mean_vaf_of_all_windows": _mean(vaf),
+        "threshold": estimates.threshold,
+        "notes": list(estimates.notes),
+    }
+
+
+def _at_joint(estimates: Estimates, parts: list[_HumanPart]) -> dict[str, Any] | None:
+    """The same parameters on the joint's side of the gear, where there is one."""
+    if all(part.model.gear_ratio == 1 for part in parts):
+        return None
+    factor = np.ones(len(estimates.names))
+    for part in parts:
+        factor[part.columns] = part.factor
+    equilibrium = _equilibria(parts, estimates.verdicts.trusted, geared=True)
+    reflex = {reflex.name: _reflex(reflex, estimates, factor) for reflex in estimates.reflexes}
+    return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium, "reflex": reflex}
+
+
+def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
+    """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
+    factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
+    estimates = estimates.summarised()
+    fit, trusted = estimates.fit, estimates.verdicts.trusted
+    theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
+    low, high = confidence_interval(theta, stderr, fit.dof)
+    return {
+        name: {
+            "unit": unit,
+            "mean": _mean(theta[trusted, k]),
+            "sd": _spread(theta[trusted, k]),
+            "median_stderr": _median(stderr[trusted, k]),
+            "half_width_95": _median((high - low)[trusted, k] / 2),
+        }
+        for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True))
+    }
+
+
+def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | None = None) -> dict[str, Any]:
+    """Delay and weights of a reflex over the trusted windows. The delay is a quotient: its median is told, no error."""
+    trusted, scale = estimates.verdicts.trusted, 1.0 if factor is None else factor[reflex.columns[0]]
+    theta, stderr = (scale * np.asarray(x)[:, reflex.columns] for x in (estimates.fit.theta, estimates.fit.stderr))
+    low, high = confidence_interval(jnp.asarray(theta), jnp.asarray(stderr), estimates.fit.dof)
+    delay = reflex.delay[trusted]
+    return {
+        "delay": {"unit": "s", "median": _median(delay[np.isfinite(delay)]), "sd": _spread(delay[np.isfinite(delay)])},
+        "lags_s": reflex.lags.tolist(),
+        "weights": {
+            "unit": reflex.unit,
+            "mean": [_mean(column) for column in theta[trusted].T],
+            "sd": [_spread(column) for column in theta[trusted].T],
+            "half_width_95": [_median(column) for column in (high - low)[trusted].T / 2],
+        },
+    }
+
+
+def _equilibria(parts: list[_HumanPart], trusted: NDArray[np.bool_], geared: bool) -> dict[str, dict[str, Any]]:
+    """The equilibrium position of every joint with an offset: a quotient, so that its median is told and no error."""
+    found = {}
+    for part in parts:
+        if part.model.offset:
+            position = part.equilibrium()[trusted] / (part.model.gear_ratio if geared else 1)
+            found[f"{part.prefix}equilibrium"] = {
+                "unit": part.position_unit,
+                "median": _median(position),
+                "sd": _spread(position),
+            }
+    return found
+
+
+def _robot(estimates: Estimates, robot: Model | None) -> dict[str, dict[str, Any]] | None:
+    """Parameters of the robot alone, where a method estimated them."""
+    if estimates.robot is None or robot is None:
+        return None
+    values = zip(
+        estimates.robot_names,
+        robot.units,
+        np.asarray(estimates.robot.theta),
+        np.asarray(estimates.robot.stderr),
+        strict=True,
+    )
+    return {name: {"unit": unit, "value": theta, "stderr": stderr} for name, unit, theta, stderr in values}
+
+
+def _example(estimates: Estimates, verdict: str) -> str:
+    """The reason of the middle one of the windows with this verdict."""
+    reasons = estimates.verdicts.reason[estimates.verdicts.verdict == verdict]
+    return str(reasons[len(reasons) // 2])
+
+
+def _notes(content: dict[str, Any]) -> list[str]:
+    """What the results say of themselves; what a further method repeats is told once."""
+    told: dict[str, str] = {}
+    for result in (content, *content["further_methods"]):
+        for note in result["notes"]:
+            whose = result is not content or note == result["method_description"]
+            told.setdefault(note, f"method {result['method']}: {note}" if whose else note)
+    return list(told.values())
+
+
+def _settings(content: dict[str, Any]) -> dict[str, str]:
+    """Sampling, filters, windows and limits, as a person reads them."""
+    recording, filters, limits = content["recording"], content["filters"], content["trust_limits"]
+
+    def cutoff(kind: str, order: str) -> str:
+        return "none" if filters[kind] is None else f"{filters[kind]:g} Hz, Butterworth of order {filters[order]}"
+
+    threshold, step = content["threshold"], content["step_s"]
+    speed = "m/s" if set(recording["joints"]) == {"prismatic"} else "rad/s"
+    return {
+        "recording": f"{recording['samples']} samples, {percent(recording['valid_share'])} of them valid",
+        "sample rate": f"{recording['sample_rate_hz']:.6g} Hz",
+        "joints": ", ".join(recording["joints"]),
+        "low-pass of the position": cutoff("position_cutoff", "position_order"),
+        "low-pass of torque and regressor": cutoff("decimation_cutoff", "decimation_order"),
+        "high-pass of torque and regressor": cutoff("high_pass", "high_pass_order"),
+        "samples kept after the filters": "all" if filters["decimate"] == 1 else f"one of {filters['decimate']}",
+        "filters run": "once, over the whole recording" if filters["mode"] == "once" else "inside every window",
+        "derivatives": "measured" if filters["measured_derivatives"] else "central differences of the position",
+        "window": f"{content['window_s']:g} s" + ("" if step is None else f", one every {step:.3g} s"),
+        "slowest motion that counts": f"{content['min_velocity']:g} {speed}" if content["min_velocity"] else "any",
+        "threshold on the condition number": "none" if threshold is None else f"{threshold:.4g}",
+        "to be trusted, a window needs": f"a VAF of {limits['min_vaf']:g}, standard errors below "
+        f"{percent(limits['max_relative_stderr'])}, columns {limits['min_excitation_ratio']:g} times above position "
+        f"noise, {percent(limits['min_valid_share'])} of its samples",
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    """Standard deviation; one window has none."""
+    return float(values.std(ddof=1)) if len(values) > 1 else math.nan

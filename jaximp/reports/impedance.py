@@ -1,0 +1,310 @@
+"""Results of perturbation trials on disk: table, summary, figures, and one HTML report that says it all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Array
+
+from jaximp import plots
+from jaximp.jobs.job import Job
+from jaximp.models import (
+    Ellipse,
+    EndpointImpedance,
+    ellipse,
+    endpoint_damping,
+    endpoint_impedance,
+    endpoint_stiffness,
+    propagated_stderr,
+)
+from jaximp.perturbation.impedance import ArmImpedance, TrialsResult
+from jaximp.perturbation.isolation import METHODS
+from jaximp.perturbation.output_error import MISFIT
+from jaximp.reports.pages import (
+    inline,
+    percent,
+    table_of,
+    template,
+    versions,
+    without_nan,
+    write_figures,
+    write_summary,
+)
+from jaximp.types import Numbers
+
+TITLES = {
+    "deviations": "What the perturbations changed",
+    "spectra": "Where the movement ends and the perturbation begins",
+    "torques": "Joint torques",
+    "ellipses": "Impedance at the hand",
+    "windows": "Lengths of the window",
+    "methods": "Methods",
+}
+CAPTIONS = {
+    "deviations": "The movement that would have been less the perturbed one, at the hand, from the onset on. Trials "
+    "that leave the others are worth a look: was the onset found, did the hand hold the handle?",
+    "spectra": "Mean energy of the jerk by frequency. The high-pass begins where perturbed trials have more energy on "
+    "top than unperturbed ones have at all; what the movement has beyond it passes for an answer to the perturbation.",
+    "torques": "Torque of the handle on the joints, less what the inertia takes, against what damping and stiffness "
+    "make of the deviations.",
+    "ellipses": "Stiffness, damping and inertia that are felt at the hand, where it was at the onset. (A force that "
+    "the hand exerts meanwhile adds to its stiffness; that part is left out.)",
+    "windows": "The same trials from shorter and longer windows. Where estimates go on changing up to the window that "
+    "was chosen, they depend on it; beyond the voluntary delay the arm may answer at will.",
+    "methods": "The same trials by other methods; hollow and pale where the estimate is not trusted.",
+}
+"""Figures in the order of the report, and how to read them."""
+
+
+def write_trials_results(folder: str | Path, result: TrialsResult, job: Job) -> None:
+    """Write `estimates.parquet`, `summary.json`, `report.html` and every figure as a PNG file into a folder."""
+    folder = Path(folder)
+    figures = draw_figures(result)
+    content = summary(result, job)
+    pq.write_table(estimates_table(result, job), folder / "estimates.parquet")
+    write_figures(folder, figures)
+    write_summary(folder, content)
+    write_report(folder / "report.html", result, job, figures)
+
+
+def draw_figures(result: TrialsResult) -> dict[str, bytes]:
+    """All figures of a report as PNG files."""
+    main = result.main
+    figures = {"deviations": plots.deviations(main)}
+    if main.misfit is None:  # a method that need not know the acceleration well has no torques to show
+        figures["torques"] = plots.joint_torques(main)
+    figures["ellipses"] = plots.ellipses(
+        main.arm.geometry, main.angles, {METHODS[one.method].short: _at_hand(one) for one in result.estimates}
+    )
+    if result.spectra is not None:
+        cutoff = next((one.cutoff for one in result.estimates if one.cutoff is not None), None)
+        figures["spectra"] = plots.jerk_spectra(result.spectra, cutoff)
+    if result.windows is not None:
+        figures["windows"] = plots.impedance_windows(result.windows, main.window)
+    if len(result.estimates) > 1:
+        figures["methods"] = plots.impedance_methods(result.estimates)
+    return {name: plots.png(figure) for name, figure in figures.items()}
+
+
+def write_report(path: str | Path, result: TrialsResult, job: Job, figures: Mapping[str, bytes] | None = None) -> None:
+    """Write one HTML file that needs no other file, no network and no script.
+
+    **Arguments:** `figures` PNG files by name, where they are drawn already.
+    """
+    images = draw_figures(result) if figures is None else figures
+    content = summary(result, job)
+    page = template("impedance.jinja").render(
+        content=content, titles=TITLES, figures=inline(images, CAPTIONS), settings=_settings(content)
+    )
+    Path(path).write_text(page, encoding="utf-8")
+
+
+def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
+    """Everything worth knowing, as plain dictionaries, lists, numbers and text; None where there is no number.
+
+    The main method's results stand at the top level, those of further methods under `further_methods`.
+    """
+    assert job.trials is not None
+    handle = result.main.arm.handle
+    content = {
+        **_result(result.main),
+        "further_methods": [_result(one) for one in result.estimates[1:]],
+        "window_lengths": _windows(result),
+        "endpoint": endpoint(result.main),
+        "recording": {
+            "name": _name(job),
+            "sample_rate_hz": result.main.sample_rate,
+            "perturbed": result.main.trials,
+            "unperturbed": result.main.unperturbed,
+            "postures": result.postures,
+        },
+        "arm": {
+            "lengths_m": list(result.main.arm.geometry.lengths),
+            "handle_mass_kg": None if handle is None else np.asarray(handle.mass, float).tolist(),
+            "handle_damping_Ns_per_m": None if handle is None else np.asarray(handle.damping, float).tolist(),
+            "inertia_from": "given" if result.static is None else "the static task",
+        },
+        "trust_limits": asdict(job.trust),
+        "versions": versions(),
+        "job": job.text,
+    }
+    return without_nan(content)
+
+
+def endpoint(found: ArmImpedance) -> dict[str, Any]:
+    """Impedance at the hand where it was at the onset, and its ellipses, with the standard errors of D and K."""
+    at_hand = _at_hand(found)
+    content: dict[str, Any] = {"position_m": found.position.tolist(), "angles_rad": found.angles.tolist()}
+    for name, unit, letter in (("inertia", "kg", ""), ("damping", "Ns_per_m", "D"), ("stiffness", "N_per_m", "K")):
+        matrix = getattr(at_hand, name)
+        content[f"{name}_{unit}"] = np.asarray(matrix).tolist()
+        content[f"{name}_ellipse"] = _in_plain_numbers(ellipse(matrix))
+        if letter:
+            spread = propagated_stderr(
+                partial(_ellipse_of, found, letter), jnp.asarray(found.theta), jnp.asarray(found.covariance)
+            )
+            content[f"{name}_ellipse_stderr"] = _in_plain_numbers(spread)
+    return content
+
+
+def _at_hand(found: ArmImpedance) -> EndpointImpedance:
+    return endpoint_impedance(found.arm.geometry, found.angles, found.improved.xi, found.D, found.K)
+
+
+def _ellipse_of(found: ArmImpedance, letter: str, theta: Array) -> Ellipse:
+    """At the hand, of the damping or stiffness among estimates."""
+    at = {name: theta[k] for k, name in enumerate(found.names)}
+    rows = [[at.get(f"{letter}{i}{j}", at[f"{letter}12"]) for j in (1, 2)] for i in (1, 2)]
+    of_hand = endpoint_damping if letter == "D" else endpoint_stiffness
+    return ellipse(of_hand(found.arm.geometry, jnp.asarray(found.angles), jnp.array(rows)))
+
+
+def _in_plain_numbers(one: Ellipse) -> dict[str, float]:
+    return {name: float(value) for name, value in vars(one).items()}
+
+
+def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
+    """One row per method. A column's unit is its field's metadata `unit`; the job's text is in the schema's."""
+    several = result.estimates
+    columns: list[tuple[str, str, Any]] = [
+        ("method", "", [one.method for one in several]),
+        ("window_s", "s", [one.window for one in several]),
+        ("trials", "1", [one.trials for one in several]),
+    ]
+    units = {name: unit for one in several for name, unit in zip(one.names, one.units, strict=True)}
+    for name, unit in sorted(units.items()):
+        for ending, values in (("", "theta"), ("_stderr", "stderr")):
+            columns.append((name + ending, unit, [_element(one, name, getattr(one, values)) for one in several]))
+    for k in range(3):
+        stderr = [np.nan if one.inertia_stderr is None else one.inertia_stderr[k] for one in several]
+        columns += [
+            (f"inertia_{k + 1}", "kg m^2", [one.inertia[k] for one in several]),
+            (f"inertia_{k + 1}_stderr", "kg m^2", stderr),
+        ]
+    columns += [
+        ("unperturbed", "1", [one.unperturbed for one in several]),
+        ("delay_s", "s", [np.nan if one.own is None else float(one.own.delay) for one in several]),
+        ("misfit", "1", [np.nan if one.misfit is None else one.misfit for one in several]),
+        ("dof", "1", [one.dof for one in several]),
+        ("explained", "1", [one.explained for one in several]),
+        ("held_out", "1", [one.held_out for one in several]),
+        ("verdict", "", [one.verdict for one in several]),
+        ("reason", "", [one.reason for one in several]),
+    ]
+    return table_of(columns, "" if job is None else job.text)
+
+
+def _element(found: ArmImpedance, name: str, values: Numbers) -> float:
+    """K21 is K12 where a method makes the stiffness symmetric."""
+    return float(values[found.names.index(name if name in found.names else "K12")])
+
+
+def _result(found: ArmImpedance) -> dict[str, Any]:
+    """What one method found."""
+    low, high = found.interval()
+    return {
+        "method": found.method,
+        "method_short": METHODS[found.method].short,
+        "method_description": found.title,
+        "window_s": found.window,
+        "trials": found.trials,
+        "verdict": found.verdict,
+        "reason": found.reason,
+        "warnings": list(found.warnings),
+        "notes": list(found.notes),
+        "parameters": {
+            name: {
+                "unit": found.units[k],
+                "value": float(found.theta[k]),
+                "stderr": float(found.stderr[k]),
+                "low_95": float(low[k]),
+                "high_95": float(high[k]),
+                "half_width_95": float(high[k] - low[k]) / 2,
+            }
+            for k, name in enumerate(found.names)
+        },
+        "covariance": found.covariance.tolist(),
+        "dof": found.dof,
+        "damping_Nms_per_rad": found.D.tolist(),
+        "stiffness_Nm_per_rad": found.K.tolist(),
+        "stiffness_on_boundary": found.on_boundary,
+        "inertia_kgm2": found.inertia.tolist(),
+        "inertia_stderr_kgm2": None if found.inertia_stderr is None else found.inertia_stderr.tolist(),
+        "explained_share": found.explained,
+        "held_out_share": found.held_out,
+        "misfit": found.misfit,
+        "delay_s": None if found.own is None else float(found.own.delay),
+        "improved_inertia_kgm2": np.asarray(found.improved.inertia, float).tolist(),
+        "cutoff_hz": None if found.cutoff is None else found.cutoff.tolist(),
+        "hand_at_onset_m": found.position.tolist(),
+        "angles_at_onset_rad": found.angles.tolist(),
+    }
+
+
+def _windows(result: TrialsResult) -> list[dict[str, Any]]:
+    """Estimates of the main method from other windows."""
+    found = result.windows
+    if found is None:
+        return []
+    return [
+        {
+            "window_s": float(length),
+            "parameters": {
+                name: {"value": float(found.theta[row, k]), "stderr": float(found.stderr[row, k])}
+                for k, name in enumerate(found.names)
+            },
+        }
+        for row, length in enumerate(found.window)
+    ]
+
+
+def _name(job: Job) -> str:
+    """What the recordings are called."""
+    assert job.trials is not None
+    if job.trials.file is not None:
+        return job.trials.file
+    files = job.trials.files
+    return files if isinstance(files, str) else ", ".join(files or [])
+
+
+def _settings(content: dict[str, Any]) -> dict[str, str]:
+    """What was read, known and demanded, as a person reads it."""
+    recording, arm, limits = content["recording"], content["arm"], content["trust_limits"]
+
+    def numbers(values: list[float], unit: str, errors: list[float] | None = None) -> str:
+        several = [plots.number(value) for value in values]
+        if errors is not None:
+            several = [f"{value} ± {plots.number(error, 2)}" for value, error in zip(several, errors, strict=True)]
+        return f"{', '.join(several)} {unit}"
+
+    cutoff = content["cutoff_hz"]
+    inertia = numbers(content["inertia_kgm2"], "kg m²", content["inertia_stderr_kgm2"])
+    trials = f"{recording['perturbed']} perturbed, {recording['unperturbed']} unperturbed"
+    return {
+        "trials": trials + (f", {recording['postures']} perturbed postures" if recording["postures"] else ""),
+        "sample rate": f"{recording['sample_rate_hz']:.6g} Hz",
+        "method": content["method_description"],
+        "window": f"{1e3 * content['window_s']:.4g} ms after the onset",
+        "high-pass of the jerk": "none" if cutoff is None else numbers(cutoff, "Hz"),
+        "mean place of the hand at the onset": f"{', '.join(f'{x:.3f}' for x in content['hand_at_onset_m'])} m",
+        "lengths of the arm": numbers(arm["lengths_m"], "m"),
+        f"inertia, {'as given' if arm['inertia_from'] == 'given' else 'from ' + arm['inertia_from']}": inertia,
+        "mass and damping of the handle": "not stated"
+        if arm["handle_mass_kg"] is None
+        else f"{numbers(arm['handle_mass_kg'], 'kg')}; {numbers(arm['handle_damping_Ns_per_m'], 'N s/m')}",
+        "to be trusted, an estimate needs": f"standard errors below {percent(limits['max_relative_stderr'])} of its "
+        "matrix, a stiffness and a damping that are not indefinite, "
+        + (
+            f"{percent(limits['min_vaf'])} of the torque explained and predicted"
+            if content["misfit"] is None
+            else f"residuals at most {MISFIT:g} times as large as expected"
+        ),
+    }

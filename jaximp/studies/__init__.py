@@ -1,1 +1,0 @@
-"""What the papers show, redone with this package; one module a paper."""

@@ -1,0 +1,1 @@
+"""Which estimates to believe, and why not."""
