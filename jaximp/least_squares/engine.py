@@ -682,8 +682,8 @@ def _full(triangle: Rows) -> Array:
 def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array]:
     """Largest and smallest singular value of the triangle `given`, as eigenvalues of its Gram matrix.
 
-    The smallest of these drowns in rounding where the matrix is ill conditioned; if any is, it is found as the largest
-    of the inverse, which does not.
+    The smallest of these drowns in rounding where the matrix is ill conditioned; there it is found as the largest of
+    the inverse, which does not. What a window gets does not depend on the other lanes.
     """
     p, rounding = len(given), jnp.finfo(given.dtype).eps
 
@@ -693,14 +693,18 @@ def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array
     def inverse_gram() -> Array:
         return jnp.stack([_total(inverse[i, k] * inverse[:, k] for k in range(i, p)) for i in range(p)])
 
+    def drowned(largest: Array, smallest: Array) -> Array:
+        return smallest < WELL_CONDITIONED * rounding * largest
+
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
         count, largest, smallest = state
-        return (count == 0) | ((count == 1) & (smallest < WELL_CONDITIONED * rounding * largest).any())
+        return (count == 0) | ((count == 1) & drowned(largest, smallest).any())
 
     def find(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, largest, _ = state
+        count, largest, smallest = state
         low, high = extreme_eigenvalues(keep(lax.cond(count == 0, gram, inverse_gram)))
-        return keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, 1 / high)))
+        again = jnp.where(drowned(largest, smallest), 1 / high, smallest)
+        return keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, again)))
 
     nothing = jnp.zeros_like(given[0, 0])
     _, largest, smallest = lax.while_loop(unfinished, find, (jnp.zeros((), int), nothing, nothing))
@@ -741,16 +745,22 @@ def _upper_bound(diagonal: Array, squares: Array) -> Array:
 
 
 def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
-    """Largest eigenvalue of a tridiagonal matrix: Laguerre's iteration falls to it from above and never passes it."""
+    """Largest eigenvalue of a tridiagonal matrix: Laguerre's iteration falls to it from above and never passes it.
+
+    A lane that has converged stays as it is while others go on.
+    """
     p = len(diagonal)
     small = 4 * jnp.finfo(diagonal.dtype).eps
 
+    def moving(value: Array, step: Array) -> Array:
+        return step > small * jnp.abs(value)
+
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
         value, step, count = state
-        return (step > small * jnp.abs(value)).any() & (count < MOST_ITERATIONS)
+        return moving(value, step).any() & (count < MOST_ITERATIONS)
 
     def improve(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        value, _, count = state
+        value, before, count = state
         first = second = slope = curve = coupling = jnp.zeros_like(value)
         above = jnp.ones(value.shape, bool)
         for i in range(p):
@@ -762,7 +772,7 @@ def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
             coupling = squares[i] * over
             first, second = first + slope, second + slope**2 - curve
         root = jnp.sqrt(jnp.maximum((p - 1) * (p * second - first**2), 0))
-        step = jnp.where(above, p / (first + root), 0)
+        step = jnp.where(above & moving(value, before), p / (first + root), 0)
         return keep((value - step, step, count + 1))
 
     return lax.while_loop(unfinished, improve, (start, jnp.full_like(start, jnp.inf), jnp.zeros((), int)))[0]

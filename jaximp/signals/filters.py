@@ -76,18 +76,23 @@ def filter_zero_phase_padded(
 ) -> Float[Array, "N k"]:
     """`filter_zero_phase` of the first n samples; what stands behind them means nothing, before and after.
 
-    The extension is made at the true end. Between the two passes everything behind it takes the value at its end: a
-    filter that begins at rest there stays at rest, so that the numbers are those of the samples alone, to rounding.
+    The extension is made at the true end, and the pass backward begins there: the numbers do not depend on how many
+    samples follow, to the last bit.
     """
-    edge, index = filters.edge, jnp.arange(x.shape[0] + filters.edge)
+    edge, rows = filters.edge, x.shape[0] + filters.edge
     start = 2 * x[:1] - x[edge:0:-1]
     behind = jnp.concatenate([x, jnp.zeros((edge, x.shape[1]), x.dtype)])
     end = lax.dynamic_slice_in_dim(behind, n - 1 - edge, edge + 1)
     end = lax.dynamic_update_slice_in_dim(behind, 2 * end[-1:] - end[-2::-1], n, 0)
+
+    def reversed_from_end(y: Array) -> Array:
+        """The first n + edge samples in reverse order, and something behind them; its own inverse."""
+        turned = jnp.concatenate([y[::-1], jnp.zeros_like(y)])
+        return lax.dynamic_slice_in_dim(turned, rows - n - edge, rows)
+
     y = _filter(filters.sos, filters.rest, jnp.concatenate([start, end]), backward=False)[edge:]
-    last = lax.dynamic_slice_in_dim(y, n + edge - 1, 1)
-    y = _filter(filters.sos, filters.rest, jnp.where(index[:, None] < n + edge, y, last), backward=True)
-    return y[:-edge]
+    y = _filter(filters.sos, filters.rest, reversed_from_end(y), backward=False)
+    return reversed_from_end(y)[:-edge]
 
 
 class PaddedFilter(eqx.Module):
