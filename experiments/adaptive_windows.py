@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import SlidingFit, adaptive_least_squares, parse_job, plots, sliding_least_squares
-from jaximp.identification.identify import prepare
+from jaximp.jobs.run import prepare
 from jaximp.simulation.rig import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
 

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jaximp import identify, parse_job
-from jaximp.identification.regression import design_filters, noise_of_rows, regress
+from jaximp.identification.identify import prepare
 from jaximp.least_squares.window import least_squares
 
 jax.config.update("jax_enable_x64", True)
@@ -89,11 +89,9 @@ def emps() -> dict[str, Any]:
     """Whole recording and windows of 5 s against the published parameters."""
     job = parse_job(EMPS, DATA)
     recording = job.load()
-    model = job.models(recording.joints)[0]
-    assert model is not None
-    filters = design_filters(job.filter, recording.sample_rate)
-    rows = regress(model, recording, job, filters)
-    whole = least_squares(rows.W, rows.torque, rows.valid, noise_of_rows(job, recording, filters))
+    prepared = prepare(job.pipeline_for(recording), recording)
+    model, rows = prepared.model, prepared.rows
+    whole = least_squares(rows.W, rows.torque, rows.valid, prepared.noise)
     estimates = identify(job)[0]
     mass = np.asarray(estimates.fit.theta)[:, model.names.index("inertia")]
     published = {
@@ -140,12 +138,10 @@ def pendulum() -> dict[str, Any]:
     for name in files:
         job = parse_job(PENDULUM.replace("FILE", name), DATA)
         recording = job.load()
-        model = job.models(recording.joints)[0]
-        assert model is not None
-        filters = design_filters(job.filter, recording.sample_rate)
-        rows = regress(model, recording, job, filters)
+        prepared = prepare(job.pipeline_for(recording), recording)
+        model, rows = prepared.model, prepared.rows
         parts.append((np.asarray(rows.W), np.asarray(rows.torque), rows.valid))
-    noise = noise_of_rows(job, recording, filters)
+    noise = prepared.noise
 
     def fit(chosen: list[int]) -> Any:
         W, torque, valid = (np.concatenate([parts[k][i] for k in chosen]) for i in range(3))

@@ -20,8 +20,9 @@ from real_recordings import ANKLE, DATA, REFLEX
 from scipy.signal import butter, cont2discrete, lfilter, sosfiltfilt
 
 from jaximp import parse_job, plots
-from jaximp.identification.identify import Prepared, identify_recording, prepare
+from jaximp.identification.identify import Prepared, prepare
 from jaximp.jobs.job import Job
+from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.window import confidence_interval, least_squares
 from jaximp.models import pathway_of, reflex_gain
 from jaximp.recordings.load import recording_from_arrays
@@ -108,7 +109,10 @@ def ankle(text: str) -> dict[str, Any]:
     for name, reflex in MODELS.items():
         job = job_of(text, reflex)
         recording = job.load()
-        found[name] = {"whole": whole(prepare(job, recording)), "windows": in_windows_of_5_s(job, recording)}
+        found[name] = {
+            "whole": whole(prepare(job, recording)),
+            "windows": in_windows_of_5_s(job, recording),
+        }
     found["banks"] = {
         name: whole(prepare(job_of(text, reflex), recording)) | {"next_window_vaf": next_window(job_of(text, reflex))}
         for name, reflex in BANKS.items()
@@ -118,8 +122,8 @@ def ankle(text: str) -> dict[str, Any]:
 
 def next_window(job: Job) -> float:
     """VAF of the 5 s after windows of 5 s."""
-    prepared = prepare(job, job.load())
-    rows, length = prepared.rows, round(5 * prepared.recording.sample_rate / prepared.filters.decimate)
+    prepared = prepare(job)
+    rows, length = prepared.rows, round(5 * prepared.recording.sample_rate / prepared.pipeline.filters.decimate)
     W, torque, valid = np.asarray(rows.W), np.asarray(rows.torque), rows.valid
     known = np.flatnonzero(valid)
     shares = []
@@ -189,7 +193,7 @@ def kernels() -> Any:
     lines, bands = [], {}
     for name, text in (("z_pf", REFLEX), ("z_df2", ANKLE)):
         job = job_of(text, "true")
-        prepared = prepare(job, job.load())
+        prepared = prepare(job)
         found, lags = fit(prepared), 1e3 * np.array(pathway_of(prepared.model).lags)
         low, high = confidence_interval(found.theta, found.stderr, found.dof)
         lines.append((name, lags, np.asarray(found.theta)[3:]))
@@ -206,7 +210,7 @@ def torque_lines() -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]
     lines: list[tuple[str, NDArray[np.float64], NDArray[np.float64]]] = []
     for label, reflex in (("without", "false"), ("with reflex", "true")):
         job = job_of(REFLEX, reflex)
-        prepared = prepare(job, job.load())
+        prepared = prepare(job)
         rows = prepared.rows
         part = (rows.time >= 40) & (rows.time < 42)
         if not lines:

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from jaximp import Limits, design_excitation, parse_job, sliding_least_squares
-from jaximp.identification.identify import prepare
+from jaximp.jobs.run import prepare
 from jaximp.models import HumanJoint, RobotJoint
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.simulation.rig import HUMAN_TRAJECTORY, HumanLoad, Rig

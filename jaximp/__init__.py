@@ -3,8 +3,10 @@
 from jaximp import models
 from jaximp.design.excitation import Design, Encoder, Limits, design_excitation
 from jaximp.design.perturbations import Perturbations, design_perturbations
-from jaximp.identification.identify import Estimates, identify, identify_recording
-from jaximp.jobs.job import FilterSettings, Job, parse_job, read_job
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.filters import FilterSettings
+from jaximp.jobs.job import Job, parse_job, read_job
+from jaximp.jobs.run import identify, identify_recording, infer, infer_recording, infer_trials
 from jaximp.least_squares.noise import Noise, fit_noise, joined, whiten
 from jaximp.least_squares.recursive import RecursiveFit, recursive_least_squares
 from jaximp.least_squares.sliding import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
@@ -43,7 +45,7 @@ from jaximp.posterior.draws import (
     summarise,
 )
 from jaximp.posterior.files import load_posterior, save_posterior, to_inference_data
-from jaximp.posterior.inference import Inference, compare_models, infer, infer_recording, infer_trials
+from jaximp.posterior.inference import Inference, compare_models
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
 from jaximp.recordings.load import (

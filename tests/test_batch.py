@@ -16,20 +16,35 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from browser import browser, executable
+from numpy.typing import NDArray
 
 from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
 from jaximp.batch.plan import find_items, make_plan, padded_sizes
-from jaximp.identification import stacks
-from jaximp.identification.identify import Estimates, identify_recording, in_windows
+from jaximp.identification import regression
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.identify import (
+    Prepared,
+    _columns_by_joint,
+    in_windows,
+    prepare,
+    share_of_stack,
+    solve_windows,
+)
+from jaximp.identification.windows import Solved, place_windows
 from jaximp.jobs.job import Job, parse_job, read_job
+from jaximp.jobs.run import identify_recording
 from jaximp.least_squares import sliding as windows
+from jaximp.least_squares.sliding import Score, score, sliding_least_squares
+from jaximp.least_squares.window import SlidingFit
+from jaximp.numerics import compilation
 from jaximp.recordings import readers
 from jaximp.recordings.load import recording_from_arrays, save_recording
 from jaximp.types import Recording
@@ -132,24 +147,30 @@ def content(out: Path) -> dict[str, object]:
 # --- what a stack gives -----------------------------------------------------------------------------------------------
 
 
-def assert_same(found: Estimates, expected: Estimates) -> None:
-    """To rounding; where the windows hardly determine the parameters, rounding is what conditioning makes of it."""
+def assert_same(found: Estimates, expected: Estimates, rtol: float = 0) -> None:
+    """To the last bit, unless a tolerance is given."""
     assert found.names == expected.names
     np.testing.assert_array_equal(found.verdicts.verdict, expected.verdicts.verdict)
-    trusted = expected.verdicts.trusted
-    assert trusted.any()
-    for name in ("theta", "stderr", "dof", "cond", "sigma_min", "excitation", "residual_rms", "vaf", "samples"):
-        ours, theirs = (np.asarray(getattr(estimates.fit, name)) for estimates in (found, expected))
-        np.testing.assert_allclose(ours[trusted], theirs[trusted], 1e-9, 0, err_msg=name)
-        np.testing.assert_allclose(ours, theirs, 1e-4, 1e-9, err_msg=name)
-    np.testing.assert_array_equal(found.fit.first, expected.fit.first)
-    np.testing.assert_array_equal(found.fit.last, expected.fit.last)
-    np.testing.assert_allclose(found.held_out_vaf[trusted], expected.held_out_vaf[trusted], 1e-9, 1e-9)
-    np.testing.assert_array_equal(np.isnan(found.held_out_vaf), np.isnan(expected.held_out_vaf))
+    for ours, theirs in zip(jax.tree.leaves(found.fit), jax.tree.leaves(expected.fit), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol)
+    np.testing.assert_allclose(found.held_out_vaf, expected.held_out_vaf, rtol)
     np.testing.assert_array_equal(found.start, expected.start)
     np.testing.assert_array_equal(found.end, expected.end)
     assert found.threshold == expected.threshold
     assert found.notes == expected.notes
+
+
+def assert_near(found: Solved, expected: SlidingFit, unseen: Score, trusted: NDArray[np.bool_]) -> None:
+    """To rounding; where the windows hardly determine the parameters, rounding is what conditioning makes of it."""
+    for name in ("theta", "stderr", "dof", "cond", "sigma_min", "excitation", "residual_rms", "vaf", "samples"):
+        ours, theirs = (np.asarray(getattr(fit, name)) for fit in (found.fit, expected))
+        np.testing.assert_allclose(ours[trusted], theirs[trusted], 1e-9, 0, err_msg=name)
+        np.testing.assert_allclose(ours, theirs, 1e-4, 1e-9, err_msg=name)
+    np.testing.assert_array_equal(found.fit.first, expected.first)
+    np.testing.assert_array_equal(found.fit.last, expected.last)
+    ours, theirs = np.asarray(found.unseen.vaf), np.asarray(unseen.vaf)
+    np.testing.assert_allclose(ours[trusted], theirs[trusted], 1e-9, 1e-9)
+    np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs))
 
 
 CASES = {
@@ -165,26 +186,47 @@ CASES = {
 }
 
 
+def stacked(job: Job, recordings: list[Recording], padded: int, size: int) -> list[Prepared]:
+    """Filtered and solved as a batch does it."""
+    measured = [regression.measure(job.pipeline_for(recording), recording) for recording in recordings]
+    found = regression.regress_stack(measured, padded, size)
+    rows = -(-padded // measured[0].pipeline.filters.decimate)
+    return solve_windows([share_of_stack(one, found, k) for k, one in enumerate(measured)], rows, size)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) -> None:
+    recordings, old, new = CASES[case]
+    job = parse_job(JOB.replace(old, new) if old else JOB)
+    prepared = stacked(job, recordings[:1], 1400, 2)[0]
+    trusted = in_windows(prepared, curves=False)[0].verdicts.trusted
+    assert trusted.any()
+    for joint_columns, found in zip(_columns_by_joint(prepared.model), prepared.solved, strict=True):
+        rows = prepared.rows if joint_columns is None else prepared.rows.of_joint(*joint_columns)
+        place = place_windows(prepared.pipeline, rows)
+        given = rows.W, rows.torque
+        fit = sliding_least_squares(*given, place.window, place.step, valid=rows.valid, noise=prepared.noise)
+        unseen = score(*given, rows.valid, fit.theta, place.next_starts, place.window, place.step)
+        assert_near(found, fit, unseen, trusted)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_a_padded_recording_gives_what_it_gives_alone(case: str) -> None:
+    """In a stack of its own length to the last bit, padded to rounding."""
     recordings, old, new = CASES[case]
     job = parse_job(JOB.replace(old, new) if old else JOB)
     for recording in recordings:
-        one = stacks.measure(job, recording)
-        prepared = stacks.solve_stack(job, [one], one.layout(job, 1400, 2))[0]
-        assert not isinstance(prepared, ValueError)
-        assert_same(in_windows(job, prepared, curves=False)[0], identify_recording(job, recording)[0])
+        alone = identify_recording(job, recording)[0]
+        assert_same(in_windows(stacked(job, [recording], len(recording), 2)[0], curves=False)[0], alone)
+        assert_same(in_windows(stacked(job, [recording], 1400, 2)[0], curves=False)[0], alone, 1e-8)
 
 
 def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
     job = parse_job(JOB)
-    measured = [stacks.measure(job, joint(n, n)) for n in (1390, 1000)]
-    layout = measured[0].layout(job, 1400, 2)
-    together = stacks.solve_stack(job, measured, layout)
-    alone = [stacks.solve_stack(job, [one], layout)[0] for one in measured]
+    recordings = [joint(n, n) for n in (1390, 1000)]
+    together = stacked(job, recordings, 1400, 2)
+    alone = [stacked(job, [one], 1400, 2)[0] for one in recordings]
     for one, other in zip(together, alone, strict=True):
-        assert not isinstance(one, ValueError)
-        assert not isinstance(other, ValueError)
         np.testing.assert_array_equal(one.solved[0].fit.theta, other.solved[0].fit.theta)
         np.testing.assert_array_equal(one.solved[0].fit.stderr, other.solved[0].fit.stderr)
 
@@ -193,23 +235,23 @@ def test_one_window_as_long_as_the_recording() -> None:
     """A program of a few windows only once made XLA break off the process."""
     job = parse_job(JOB.replace("decimation_cutoff = 10", "").replace("length = 1", "length = 4"))
     recording = joint(1000)
-    measured = stacks.measure(job, recording)
-    found = stacks.solve_stack(job, [measured], measured.layout(job, 1000, 1))[0]
-    assert not isinstance(found, ValueError)
-    theta = in_windows(job, found, curves=False)[0].fit.theta
+    prepared = prepare(job.pipeline_for(recording), recording)
+    theta, rows = in_windows(prepared)[0].fit.theta, prepared.rows
     assert len(theta) == 1
-    np.testing.assert_allclose(theta, identify_recording(job, recording)[0].fit.theta, 1e-9)
+    expected = np.linalg.lstsq(rows.W[rows.valid], rows.torque[rows.valid])[0]
+    np.testing.assert_allclose(theta[0], expected, 1e-9)
 
 
 def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
     """Two devices, which XLA makes of one processor, give what one gives, and each has half of the recordings."""
     code = (
         "import jax, sys; jax.config.update('jax_enable_x64', True)\n"
-        "from jaximp.batch import run as batch; from jaximp.identification import stacks; from jaximp.jobs import job\n"
-        "program, placed = stacks._program, []\n"
+        "from jaximp.batch import run as batch; from jaximp.jobs import job\n"
+        "from jaximp.identification import windows\n"
+        "program, placed = windows._program, []\n"
         "def seen(*args):\n"
-        "    found = program(*args); placed.append(found.y.sharding.device_set); return found\n"
-        "stacks._program = seen\n"
+        "    found = program(*args); placed.append(found[0].theta.sharding.device_set); return found\n"
+        "windows._program = seen\n"
         "batch.run(job.read_job(sys.argv[1] + '/job.toml'), out=sys.argv[2], manifest=sys.argv[1] + '/study.csv')\n"
         "print(sorted(map(len, placed)))"
     )
@@ -240,7 +282,9 @@ def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
     for k in range(24):
         save_recording(joint(1003 + 17 * k, k), tmp_path / f"r{k:02d}.parquet")
     jax.clear_caches()
-    stacks._known.clear()
+    regression._known.clear()
+    compilation.options()
+    jnp.zeros(())  # small programs that no length has a part in
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         outcome = batch.run(parse_job(JOB, tmp_path), [tmp_path], tmp_path / "out")
@@ -459,14 +503,14 @@ def interrupt_while_garbage_is_collected(fault: Fault, out: Path) -> None:
 
 def out_of_memory(fault: Fault, out: Path) -> None:
     """A batch does not get its memory."""
-    original = batch_results.solve_stack
+    original = batch_results.solve_windows
 
-    def solve(job: Job, several: list[stacks.Measured], layout: stacks.Layout) -> object:
+    def solve(several: list[Prepared], padded: int, size: int) -> object:
         if any(len(one.recording) == 1321 for one in several):
             raise MemoryError("no more")
-        return original(job, several, layout)
+        return original(several, padded, size)
 
-    fault.patch.setattr(batch_results, "solve_stack", solve)
+    fault.patch.setattr(batch_results, "solve_windows", solve)
     assert run(fault.study, out).exit_status == 1
 
 
@@ -641,11 +685,11 @@ def test_what_stops_a_stack_is_said_of_its_recordings(monkeypatch: pytest.Monkey
     def refuse(*args: object) -> object:
         raise ValueError("no such window")
 
-    monkeypatch.setattr(batch_results, "solve_stack", refuse)
+    monkeypatch.setattr(batch_results, "solve_windows", refuse)
     job, recording = parse_job(JOB), joint(1000)
-    measured = stacks.measure(job, recording)
+    measured = regression.measure(job.pipeline_for(recording), recording)
     result = batch_results.Result(batch_plan.Item("x", Path("x")), recording=recording)
-    result.stacked = (measured.layout(job, 1000, 1), measured.model), measured
+    result.stacked = (1000, 1, "kind"), measured
     batch_results._solve_stacks(batch_results.Task(job, Path(), (), (), (), 1), [result])
     assert (result.status, result.reason) == (batch_results.FAILED, "no such window")
 

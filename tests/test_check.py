@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from test_identify import JOB, TIME, joint
 
-from jaximp.identification.check import BAD, LOOK, check_recording, coherent_bandwidth, estimate_delay
-from jaximp.identification.identify import identify_recording
+from jaximp.identification.check import BAD, LOOK, coherent_bandwidth, estimate_delay
 from jaximp.jobs.job import parse_job
+from jaximp.jobs.run import check, identify_recording
 from jaximp.recordings.load import recording_from_arrays
 
 
 def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:
     job, recording = parse_job(JOB), joint()
-    findings, proposal = check_recording(job, recording)
+    findings, proposal = check(job, recording)
     verdicts = {finding.topic: finding.verdict for finding in findings}
     assert set(verdicts.values()) == {"ok"}, findings
     assert 6.3 < proposal.decimation_cutoff < proposal.position_cutoff < 500
@@ -25,7 +25,7 @@ def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:
 def test_delay_is_found(samples: int) -> None:
     recording = joint()
     late = replace(recording, torque=np.roll(recording.torque, samples, axis=0))
-    delay, determined = estimate_delay(parse_job(JOB), late)
+    delay, determined = estimate_delay(parse_job(JOB).pipeline_for(late), late)
     assert determined
     assert delay == pytest.approx(samples * 1e-3, abs=0.4e-3)
 
@@ -33,7 +33,7 @@ def test_delay_is_found(samples: int) -> None:
 def test_a_wrong_sign_is_named_and_never_trusted() -> None:
     recording = joint()
     wrong = replace(recording, torque=-recording.torque)
-    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), wrong)[0]}
+    found = {finding.topic: finding for finding in check(parse_job(JOB), wrong)[0]}
     assert found["torque: sign"].verdict == BAD
     verdicts = identify_recording(parse_job(JOB), wrong)[0].verdicts
     assert not verdicts.trusted.any()
@@ -46,7 +46,7 @@ def test_a_wrong_sign_is_named_and_never_trusted() -> None:
 def test_a_wrong_unit_is_noticed(time: float, angle: float, topic: str) -> None:
     recording = joint()
     wrong = recording_from_arrays(time * TIME, angle * recording.position[:, 0], recording.torque[:, 0])
-    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), wrong)[0]}
+    found = {finding.topic: finding for finding in check(parse_job(JOB), wrong)[0]}
     assert found[topic].verdict in (LOOK, BAD)
     assert found[topic].text.endswith("?") or found[topic].text.endswith("(ms?)")
 
@@ -61,7 +61,7 @@ def test_what_is_wrong_is_seen() -> None:
     coarse = np.round(recording.position / 0.01) * 0.01
     coarse[4000:] += 0.5  # the encoder lost counts
     broken = recording_from_arrays(TIME, coarse, clipped)
-    found = {finding.topic: finding for finding in check_recording(parse_job(JOB), broken)[0]}
+    found = {finding.topic: finding for finding in check(parse_job(JOB), broken)[0]}
     assert found["torque: saturation"].verdict == LOOK
     assert "-4" in found["torque: saturation"].text
     assert found["position: saturation"].verdict == "ok"

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaximp.identification.identify import identify, identify_recording, in_windows, prepare
+from jaximp.identification.identify import in_windows, prepare
 from jaximp.jobs.job import parse_job
+from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models import PlanarArm
 from jaximp.recordings.load import recording_from_arrays
@@ -102,11 +103,13 @@ def test_the_literal_mode_filters_every_window_by_itself(drop: bool) -> None:
 
 def test_other_lengths_share_the_filtered_recording() -> None:
     job, recording = parse_job(JOB), joint()
-    prepared = prepare(job, recording)
+    prepared = prepare(job.pipeline_for(recording), recording)
     half = replace(job, window=replace(job.window, length=0.5))
-    np.testing.assert_allclose(
-        in_windows(half, prepared, longest=2.0)[0].fit.theta, identify_recording(half, recording)[0].fit.theta
-    )
+    shared = in_windows(replace(prepared, pipeline=prepared.pipeline.with_window(0.5)), longest=2.0)[0]
+    alone = identify_recording(half, recording)[0]
+    np.testing.assert_allclose(shared.fit.theta, alone.fit.theta, 1e-10)
+    np.testing.assert_allclose(shared.fit.stderr, alone.fit.stderr, 1e-10)
+    np.testing.assert_allclose(shared.held_out_vaf, alone.held_out_vaf, 1e-10)
 
 
 @pytest.mark.parametrize(
@@ -178,9 +181,9 @@ def test_emps_is_the_published_joint(data_folder: Path) -> None:
         """,
         data_folder,
     )
-    prepared = prepare(job, job.load())
-    windows = in_windows(job, prepared)[0]
-    whole = in_windows(replace(job, window=replace(job.window, length=24.8)), prepared)[0]
+    prepared = prepare(job.pipeline_for(job.load()), job.load())
+    windows = in_windows(prepared)[0]
+    whole = in_windows(replace(prepared, pipeline=prepared.pipeline.with_window(24.8)))[0]
     published = {"inertia": 95.1089, "viscous_friction": 203.5034, "coulomb_friction": 20.3935}
     found = dict(zip(whole.names, np.asarray(whole.fit.theta)[0], strict=True))
     assert found["inertia"] == pytest.approx(published["inertia"], rel=0.01)

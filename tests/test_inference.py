@@ -17,11 +17,12 @@ from test_identify import JOB, TIME, TRUTH, joint
 from jaximp.cli import main as cli
 from jaximp.identification.identify import prepare
 from jaximp.jobs.job import parse_job
+from jaximp.jobs.run import infer_recording
 from jaximp.models import HumanJoint, Joints, Model, ReflexPathway, RobotJoint
 from jaximp.posterior import inference
 from jaximp.posterior.draws import Posterior, make_posterior, stacked
 from jaximp.posterior.files import load_posterior
-from jaximp.posterior.inference import Inference, compare_models, infer_recording, sentences
+from jaximp.posterior.inference import Inference, compare_models, sentences
 from jaximp.posterior.predictive import PriorPredictive
 from jaximp.recordings.load import recording_from_arrays, save_recording
 from jaximp.reports import posterior as posterior_report
@@ -245,7 +246,7 @@ def test_a_robot_alone_that_was_recorded_for_less_long_judges_no_window_less(met
     alone = recording_from_arrays(TIME[: len(noise)], q, 0.3 * velocity + noise)
     text = JOB.replace("human = true", f"{robot}\nmethods = [{method}]") + "[robot_recording]\nfile = 'in the test'\n"
     job = parse_job(text)
-    place, verdicts = inference._judged(job, prepare(job, held, alone))
+    place, verdicts = inference._judged(prepare(job.pipeline_for(held), held, alone))
     assert len(place.starts) == len(verdicts.verdict) == 8
     assert verdicts.trusted.sum() >= 6
 

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identification.identify import Estimates, identify_recording
+from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
+from jaximp.jobs.run import identify_recording
 from jaximp.models import ArmGeometry, EndpointImpedance, endpoint_impedance
 from jaximp.plots.style import POINTS, draw_line
 from jaximp.trust.verdicts import TRUSTED, WEAK, Verdicts

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from jaximp.design import excitation
-from jaximp.identification.identify import Estimates, identify, identify_recording, in_windows, prepare
-from jaximp.identification.regression import Filters, design_filters, noise_of_rows, regress, undisturbed
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.filters import Filters
+from jaximp.identification.identify import in_windows, prepare
+from jaximp.identification.regression import measure, regress, undisturbed
 from jaximp.jobs.job import FilterSettings, Job, parse_job
+from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import least_squares
 from jaximp.models import (
     HumanJoint,
@@ -225,20 +228,18 @@ def test_a_job_makes_the_model_for_the_recordings_sample_rate() -> None:
     with pytest.raises(ValueError, match="sample rate"):
         job.models(("revolute",))
     with pytest.raises(ValueError, match="250 Hz, but the recording has 500 Hz"):
-        regress(human, joint(), job, design_filters(job.filter, RATE))
+        measure(job.pipeline(("revolute",), 250.0), joint())
     inside = replace(job, filter=FilterSettings(mode="window"))
     with pytest.raises(ValueError, match="cuts off the past"):
-        regress(human, joint(), inside, design_filters(inside.filter, RATE))
+        measure(inside.pipeline_for(joint()), joint())
 
 
 def rows_of(recording: Recording) -> tuple[Numbers, NDArray[np.bool_], int, Filters]:
     job = parse_job(JOB)
     job = replace(job, filter=replace(job.filter, decimate=1))
-    model = job.models(("revolute",), RATE)[1]
-    assert model is not None
-    filters = design_filters(job.filter, RATE)
-    rows = regress(model, recording, job, filters)
-    return np.asarray(rows.W), rows.valid, model.memory, filters
+    pipeline = job.pipeline(("revolute",), RATE)
+    rows = regress(measure(pipeline, recording))[0]
+    return np.asarray(rows.W), rows.valid, pipeline.model.memory, pipeline.filters
 
 
 def test_no_row_counts_whose_past_is_not_known() -> None:
@@ -270,7 +271,7 @@ def test_no_row_counts_whose_past_is_not_known() -> None:
 def test_a_jump_is_remembered() -> None:
     q, *_ = motion()
     jumping = recording_from_arrays(np.arange(len(q)) / RATE, q + np.where(np.arange(len(q)) < 3000, 0, 0.5), q)
-    filters = design_filters(parse_job(JOB).filter, RATE)
+    filters = parse_job(JOB).pipeline(("revolute",), RATE).filters
     short, long = (undisturbed(jumping, filters, memory=memory) for memory in (0, 200))
     last = np.flatnonzero(~short[1000:5000])[-1] + 1000
     assert not long[2999 : last + 201].any()
@@ -307,11 +308,11 @@ def test_the_other_direction_is_told_by_the_sign_of_the_gain_and_by_what_is_pred
 
 def test_windows_are_those_of_numpy_and_the_gain_has_its_covariance() -> None:
     job = parse_job(JOB)
-    prepared = prepare(job, joint())
-    estimates = in_windows(job, prepared)[0]
-    rows, noise = prepared.rows, noise_of_rows(job, joint(), prepared.filters)
+    prepared = prepare(job.pipeline_for(joint()), joint())
+    estimates = in_windows(prepared)[0]
+    rows, noise = prepared.rows, prepared.noise
     (reflex,) = estimates.reflexes
-    length = round(3 * RATE / prepared.filters.decimate)
+    length = round(3 * RATE / prepared.pipeline.filters.decimate)
     for k in (1, 4):
         first = int(np.asarray(estimates.fit.first)[k])
         part = slice(first, first + length)
@@ -403,10 +404,11 @@ def test_the_report_shows_the_gain_and_not_the_weights_one_by_one(tmp_path: Path
 def test_parameters_that_are_named_are_judged() -> None:
     """By themselves the weights are not; a limit that no weight keeps shows it."""
     strict = parse_job(JOB + "[trust]\nmax_relative_stderr = 0.02\n")
-    prepared = prepare(strict, joint())
-    assert in_windows(strict, prepared)[0].verdicts.trusted.any()
+    prepared = prepare(strict.pipeline_for(joint()), joint())
+    assert in_windows(prepared)[0].verdicts.trusted.any()
     named = replace(strict, trust=replace(strict.trust, parameters=("reflex_160ms",), max_relative_stderr=1e-4))
-    found = in_windows(named, prepared)[0].verdicts
+    again = replace(prepared, pipeline=named.pipeline_for(joint()), solved=())
+    found = in_windows(again)[0].verdicts
     assert not found.trusted.any()
     assert any("reflex_160ms" in reason for reason in found.reason)
 

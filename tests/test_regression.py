@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
-from jaximp.identification.regression import Filters, design_filters, noise_of_rows, regress
+from jaximp.identification.filters import Filters
+from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
@@ -67,8 +68,8 @@ def test_every_window_is_filtered_by_itself(n_joints: int, step: float, filters:
     assert robot is not None
     assert human is not None
     model = robot + human
-    designed = design_filters(wanted.filter, RATE)
-    rows = regress(model, measured, wanted, designed)
+    pipeline = wanted.pipeline_for(measured)
+    designed, rows = pipeline.filters, regress_in_windows(pipeline, measured, model)
     starts = np.arange(0, 900 - 300 + 1, round(step * RATE))
     cuts = [slice(start, start + 300) for start in starts]
     expected, speed = (
@@ -86,8 +87,9 @@ def test_every_window_is_filtered_by_itself(n_joints: int, step: float, filters:
 
 def test_noise_of_a_window_is_the_filters_matrix_times_itself() -> None:
     measured, wanted = recording(1), job(0.05)
-    designed = design_filters(wanted.filter, RATE)
+    pipeline = wanted.pipeline_for(measured)
+    designed = pipeline.filters
     response = sosfiltfilt(np.array(designed.parallel), np.eye(300), axis=0)[:: designed.decimate]
-    noise = noise_of_rows(wanted, measured, designed)
+    noise = noise_in_windows(pipeline)
     assert noise is not None
     np.testing.assert_allclose(noise, response @ response.T, atol=1e-12)

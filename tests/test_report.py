@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from test_plots import JOB, identified, recording, without_trust
 
-from jaximp.identification.identify import Estimates
+from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import Job, parse_job
 from jaximp.reports import estimates as report
 from jaximp.types import Recording

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.identification.identify import Estimates, identify_recording
+from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
+from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import SlidingFit, sliding_least_squares
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.trust.verdicts import (

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from jaximp.identification.identify import identify_recording, regress_both
-from jaximp.identification.regression import design_filters, noise_of_rows
+from jaximp.identification.identify import noise_of, regress_pair
 from jaximp.identification.separation import fit_robot
 from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
+from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import sliding_theta
 from jaximp.simulation.rig import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
@@ -51,21 +51,17 @@ Numbers = NDArray[np.float64]
 
 def robot_alone(alone: Recording) -> Numbers:
     """The robot's parameters from its whole recording, which both sides are given."""
-    robot, human = JOB.models(alone.joints)
-    assert robot is not None
-    assert human is not None
-    once = replace(JOB, filter=replace(JOB.filter, mode="once"))
-    filters = design_filters(once.filter, RATE)
-    rows = regress_both(robot, human, alone, once, filters)[0]
-    return np.asarray(fit_robot(rows, noise_of_rows(once, alone, filters)).theta)
+    pipeline = replace(JOB, filter=replace(JOB.filter, mode="once")).pipeline_for(alone)
+    assert pipeline.robot is not None
+    rows = regress_pair(pipeline, pipeline.robot, alone)[0]
+    return np.asarray(fit_robot(rows, noise_of(pipeline)).theta)
 
 
 def ours(held: Recording, theta_robot: Numbers) -> Numbers:
     """The human's parameters in every window, (M, 4)."""
-    robot, human = JOB.models(held.joints)
-    assert robot is not None
-    assert human is not None
-    rows = regress_both(robot, human, held, JOB, design_filters(JOB.filter, RATE))[0]
+    pipeline = JOB.pipeline_for(held)
+    assert pipeline.robot is not None
+    rows = regress_pair(pipeline, pipeline.robot, held)[0]
     block = WINDOW // DECIMATE
     theta = sliding_theta(rows.human, rows.torque - rows.robot @ theta_robot, block, block, valid=rows.valid)
     return np.asarray(theta)

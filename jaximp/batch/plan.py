@@ -23,13 +23,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from jaximp.identification.regression import step_seconds
-from jaximp.identification.stacks import stack_size, stackable
+from jaximp.identification.windows import stack_size
 from jaximp.jobs.job import Job
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers import FORMATS, RecordingError, count_samples, delimiter_of
 
-MOST_SIZES = 4
+MOST_SIZES = 3
 """Padded lengths of a plan: each is compiled once, and a study should need no more than six programs."""
 MOST_SAMPLES = 100_000_000
 """A recording that claims more is refused before anything is read (2.4 GB of time, position and torque)."""
@@ -116,7 +115,7 @@ class Plan:
         model = job.model
         which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
-        windows = f"windows of {job.window.length:g} s every {step_seconds(job):g} s"
+        windows = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
         lines.append(f"model: {' and '.join(which)}{methods}; {windows}")
         counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
         for (size, stacked), count in sorted(counts.items()):
@@ -136,7 +135,7 @@ def expected_bytes(job: Job, plan: Plan) -> float:
     """Size of the results, as it was measured; windows are counted at the rate that the job states, or at 1 kHz."""
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
-    length, step = job.window.length, step_seconds(job)
+    length, step = job.window.length, job.window.step_seconds
     windows = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items)
     files = sum(len({item.partition(plan.partitions) for item in batch.items}) for batch in plan.batches)
     return 120.0 * windows + 16_000.0 * files + 30_000.0 * len(plan.batches) + 2000.0 * len(plan.items)
@@ -314,6 +313,17 @@ def why_refused(path: Path) -> str:
 # --- which are solved together ----------------------------------------------------------------------------------------
 
 
+def why_alone(job: Job) -> str:
+    """Why the recordings of a job have to be identified one by one, or nothing."""
+    if job.filter.mode == "window":
+        return "filter.mode = 'window' filters inside every window"
+    if job.model.robot is not None and job.model.human is not None:
+        return "a human in a robot needs two recordings at a time"
+    if job.model.human is not None and job.model.human.reflex:
+        return "a reflex remembers the past, and its gain is a fit of its own"
+    return ""
+
+
 def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None = None) -> Plan:
     """Look at every file's size and form batches.
 
@@ -330,7 +340,7 @@ def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None 
     _check_partitions(chosen, metadata, items)
     columns = channel_columns(job.recording)
     sized = sorted((_sized(item, columns) for item in items), key=lambda item: (item.partition(chosen), item.name))
-    why = stackable(job)
+    why = why_alone(job)
     stacked = [item for item in sized if 0 < item.samples <= LONGEST_STACKED and not why]
     sizes = padded_sizes([item.samples for item in stacked])
     groups: dict[int, list[Item]] = {size: [] for size in (*sizes, 0)}

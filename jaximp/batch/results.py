@@ -26,9 +26,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximp.batch.plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, printable, why_refused
-from jaximp.identification.identify import Estimates, Prepared, in_windows, prepare
-from jaximp.identification.regression import design_filters
-from jaximp.identification.stacks import Measured, measure, solve_stack
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.filters import design_filters
+from jaximp.identification.identify import Prepared, in_windows, prepare, share_of_stack, solve_windows
+from jaximp.identification.regression import Measured, measure, regress_stack
+from jaximp.identification.windows import LAGS_GRAIN
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import SlidingFit, confidence_interval
 from jaximp.models import Joints, Model, pathway_of
@@ -268,8 +270,8 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
             result.recording, result.about = recording, About.of(recording)
             size = next((size for size in task.sizes if size[0] >= len(recording)), None)
             if batch.padded and size is not None:
-                found = measure(task.job, recording)
-                result.stacked = (found.layout(task.job, *size), found.model), found
+                found = measure(task.job.pipeline_for(recording), recording)
+                result.stacked = (*size, _kind_of(found)), found
     result.seconds = time.perf_counter() - begin
     return result
 
@@ -316,23 +318,24 @@ def _solve_alone(task: Task, result: Result) -> None:
     begin = time.perf_counter()
     if result.recording is not None and not result.reason:
         with _reasons(result), _one_at_a_time:
-            prepared = prepare(task.job, result.recording, _alone(task, result.item))
-            result.estimates = in_windows(task.job, prepared, curves=False)
+            pipeline = task.job.pipeline_for(result.recording)
+            prepared = prepare(pipeline, result.recording, _alone(task, result.item))
+            result.estimates = in_windows(prepared, curves=False)
     result.seconds += time.perf_counter() - begin
 
 
 def _solve_stacks(task: Task, results: Sequence[Result]) -> None:
     """Estimates of every recording that is stacked, or the reason why there are none."""
-    job, stacks = task.job, dict[Any, list[tuple[Result, Measured]]]()
+    stacks = dict[Any, list[tuple[Result, Measured]]]()
     for result in results:
         if result.stacked is not None:
-            program, found = result.stacked
-            stacks.setdefault(program, []).append((result, found))
-    for (layout, _), members in stacks.items():
+            kind, found = result.stacked
+            stacks.setdefault(kind, []).append((result, found))
+    for (padded, stacked, _), members in stacks.items():
         begin = time.perf_counter()
         prepared: Sequence[Prepared | ValueError]
         try:
-            prepared = solve_stack(job, [found for _, found in members], layout)
+            prepared = _prepared([found for _, found in members], padded, stacked)
         except ValueError as error:
             prepared = [error] * len(members)
         share = (time.perf_counter() - begin) / len(members)
@@ -341,8 +344,29 @@ def _solve_stacks(task: Task, results: Sequence[Result]) -> None:
             with _reasons(result):
                 if isinstance(one, ValueError):
                     raise one
-                result.estimates = in_windows(job, one, curves=False)
+                result.estimates = in_windows(one, curves=False)
             result.seconds += share + time.perf_counter() - begin
+
+
+def _kind_of(found: Measured) -> tuple[Any, ...]:
+    """What recordings must have in common to be solved by one program."""
+    pipeline, noise = found.pipeline, found.pipeline.filters.noise
+    lags = 0 if noise is None else -(-len(noise) // LAGS_GRAIN)
+    return found.model, pipeline.filters.decimate, pipeline.window_rows, pipeline.step_rows, lags
+
+
+def _prepared(several: Sequence[Measured], padded: int, stacked: int) -> list[Prepared | ValueError]:
+    """Filtered and solved as one stack; or why nothing is left of a recording."""
+    found, results = regress_stack(several, padded, stacked), list[Prepared | ValueError]()
+    for k, one in enumerate(several):
+        try:
+            results.append(share_of_stack(one, found, k))
+        except ValueError as error:
+            results.append(error)
+    left = [one for one in results if isinstance(one, Prepared)]
+    rows = -(-padded // several[0].pipeline.filters.decimate)
+    solved = iter(solve_windows(left, rows, stacked) if left else [])
+    return [next(solved) if isinstance(one, Prepared) else one for one in results]
 
 
 def joints_of(job: Job, items: Sequence[Item]) -> int:
@@ -622,8 +646,8 @@ def write_report_of(job: Job, recording: Recording, alone: Recording | None, fol
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.estimates import write_results
 
-    prepared = prepare(job, recording, alone)
-    estimates = in_windows(job, prepared, longest=2 * job.window.length)
-    others = at_other_lengths(job, prepared, alone)
+    prepared = prepare(job.pipeline_for(recording), recording, alone)
+    estimates = in_windows(prepared, longest=2 * job.window.length)
+    others = at_other_lengths(prepared, alone)
     with new_folder(folder, force=True) as draft:
         write_results(draft, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)

@@ -45,7 +45,6 @@ from jaximp.batch.results import (
     write_late_report,
     write_whole,
 )
-from jaximp.identification.identify import checked_models
 from jaximp.jobs.job import Job
 from jaximp.least_squares.chunks import cores
 from jaximp.plots import main_parameter
@@ -223,7 +222,8 @@ def first_trouble(job: Job, plan: Plan) -> str:
     item = next((item for item in plan.items if not item.refused), None)
     if item is not None:
         try:
-            checked_models(job, load(job.recording, item.file, job.folder))
+            recording = load(job.recording, item.file, job.folder)
+            job.pipeline_for(recording).check(recording)
         except (ValueError, OSError) as error:
             return f"{item.name} would fail: {error}"
     return ""

@@ -20,7 +20,7 @@ from rich.table import Table
 from jaximp.types import Progress
 
 if TYPE_CHECKING:  # what a command needs is imported when it runs: `--help` must not wait for it
-    from jaximp.identification.identify import Estimates
+    from jaximp.identification.estimates import Estimates
     from jaximp.jobs.job import Job
     from jaximp.perturbation.impedance import ArmImpedance
 
@@ -120,7 +120,7 @@ def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
     Writes the draws as NetCDF for ArviZ, summary.json, report.html and the figures into the folder.
     """
     from jaximp.jobs.job import read_job
-    from jaximp.posterior.inference import infer, infer_trials
+    from jaximp.jobs.run import infer, infer_trials
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.posterior import write_arm_posterior, write_posterior_results
 
@@ -161,8 +161,8 @@ def check(job_file: JobFile) -> None:
     Proposes cut-off frequencies and a window for the job file. Of perturbation trials it says how many there are, and
     what the sensors allow.
     """
-    from jaximp.identification.check import check_recording
     from jaximp.jobs.job import read_job
+    from jaximp.jobs.run import check as check_recording
 
     job = read_job(job_file)
     if job.trials is not None:
@@ -337,10 +337,10 @@ def _identify_into(job: Job, folder: Path) -> None:
     with _progress("identifying") as progress:
         recording, alone = job.load(), job.load_robot_alone()
         progress(0.1)
-        prepared = prepare(job, recording, alone)
+        prepared = prepare(job.pipeline_for(recording), recording, alone)
         progress(0.3)
-        estimates = in_windows(job, prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
-        others = at_other_lengths(job, prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
+        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
+        others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
 
         write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.identification.identify import Estimates, identify_recording, jump_note
-from jaximp.identification.regression import design_filters, jumped, regress
-from jaximp.jobs.job import Job
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.identify import estimate, jump_note
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models import combine
 from jaximp.signals import filters as signals
 from jaximp.trust.verdicts import NEGATIVE, NO_DATA, WEAK
@@ -51,9 +52,9 @@ class Proposal:
 
 
 def check_recording(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    pipeline: Pipeline, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> tuple[list[Finding], Proposal]:
-    """Check a recording for the model of a job, and propose cut-offs and a window."""
+    """Check a recording for the model of a pipeline, and propose cut-offs and a window."""
     if len(recording) < FEWEST:
         raise ValueError(f"the recording has {len(recording)} samples: at least {FEWEST} are needed to check it")
     findings = [_sampling(recording), _gaps(recording)]
@@ -67,7 +68,10 @@ def check_recording(
     progress(0.1)
     bandwidth = coherent_bandwidth(recording)
     position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
-    filters = replace(job.filter, position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff, decimate=None)
+    filters = replace(
+        pipeline.filter, position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff, decimate=None
+    )
+    pipeline = replace(pipeline, filter=filters)
     findings.append(
         Finding(
             "bandwidth",
@@ -75,9 +79,9 @@ def check_recording(
             f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
         )
     )
-    findings.append(_delay(replace(job, filter=filters), recording))
+    findings.append(_delay(pipeline, recording))
     progress(0.3)
-    window, of_windows = _window(replace(job, filter=filters), recording, alone, progress)
+    window, of_windows = _window(pipeline, recording, alone, progress)
     why = (
         "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that; "
         "the window that predicts the next one best: a longer one is more precise, a shorter one follows changes sooner"
@@ -107,13 +111,16 @@ def coherent_bandwidth(recording: Recording) -> float:
     return float(max(frequency[max(1, first + length)], 5 * slow))
 
 
-def estimate_delay(job: Job, recording: Recording) -> tuple[float, bool]:
+def estimate_delay(pipeline: Pipeline, recording: Recording) -> tuple[float, bool]:
     """Delay of the torque behind the position [s] at which the model fits best, and whether the data determine it."""
-    robot, human = job.models(recording.joints, recording.sample_rate)
-    model = human if robot is None else robot if human is None else combine(robot, human)
-    assert model is not None
-    undecimated = replace(job, filter=replace(job.filter, decimate=1, mode="once"))
-    rows = regress(model, recording, undecimated, design_filters(undecimated.filter, recording.sample_rate))
+    robot, model = pipeline.robot, pipeline.model
+    undecimated = replace(
+        pipeline,
+        model=model if robot is None else combine(robot, model),
+        robot=None,
+        filter=replace(pipeline.filter, decimate=1, mode="once"),
+    )
+    rows = regress(measure(undecimated, recording))[0]
     W, torque = (np.asarray(x).reshape(len(rows.time), recording.n_joints, -1) for x in (rows.W, rows.torque))
     usable = np.atleast_1d(np.asarray(rows.valid).reshape(len(rows.time), -1).all(axis=1))
     reach = max(3, round(LONGEST_DELAY * recording.sample_rate))
@@ -194,8 +201,8 @@ def _cutoffs(bandwidth: float, recording: Recording) -> tuple[float, float]:
     return float(f"{position:.2g}"), float(f"{decimation:.2g}")
 
 
-def _delay(job: Job, recording: Recording) -> Finding:
-    delay, determined = estimate_delay(job, recording)
+def _delay(pipeline: Pipeline, recording: Recording) -> Finding:
+    delay, determined = estimate_delay(pipeline, recording)
     if not determined:
         return Finding("delay", GOOD, "the data do not determine a delay between torque and position")
     text = f"the model fits best if torque lags position by {1e3 * delay:.2f} ms"
@@ -209,14 +216,14 @@ def _delay(job: Job, recording: Recording) -> Finding:
 
 
 def _window(
-    job: Job, recording: Recording, alone: Recording | None, progress: Progress
+    pipeline: Pipeline, recording: Recording, alone: Recording | None, progress: Progress
 ) -> tuple[float | None, list[Finding]]:
     """Of a few lengths in which nine windows of ten are excited, the one that predicts the next window best."""
     duration = len(recording) / recording.sample_rate
     tried = [length for length in (0.5, 1.0, 2.0, 5.0, 10.0) if length <= duration / 3]
     seen, good, signs = [], {}, []
     for count, length in enumerate(tried):
-        estimates = _trial(job, recording, alone, length)
+        estimates = _trial(pipeline, recording, alone, length)
         progress(0.3 + 0.7 * (count + 1) / len(tried))
         if estimates is None:
             continue
@@ -233,16 +240,12 @@ def _window(
     ]
 
 
-def _trial(job: Job, recording: Recording, alone: Recording | None, length: float) -> Estimates | None:
+def _trial(pipeline: Pipeline, recording: Recording, alone: Recording | None, length: float) -> Estimates | None:
     """Estimates with windows of one length; None where it cannot be tried."""
     step = max(length / 10, len(recording) / recording.sample_rate / 200)
-    trial = replace(
-        job,
-        window=replace(job.window, length=length, step=step),
-        model=replace(job.model, methods=job.model.methods[:1]),
-    )
+    trial = replace(pipeline.with_window(length, step), methods=pipeline.methods[:1])
     with suppress(ValueError):
-        return identify_recording(trial, recording, alone)[0]
+        return estimate(trial, recording, alone)[0]
     return None
 
 

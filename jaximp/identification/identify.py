@@ -1,14 +1,13 @@
-"""The job itself: recording + model + filters + windows -> estimates with a verdict each.
+"""Recordings in memory: filtered, solved in all windows, judged.
 
-`identify` and everything that runs it for many recordings share this module; it reads and writes no files.
+`identify` and everything that runs it for many recordings share this module; it knows no files and no jobs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,146 +15,46 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaximp.identification.regression import (
-    Filters,
-    Placement,
-    Rows,
-    check_window,
-    column_noise,
-    design_filters,
-    jumped,
-    noise_of_rows,
-    regress,
-    step_seconds,
-    windows_in_rows,
-)
+from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.literal import noise_in_windows, regress_in_windows
+from jaximp.identification.pipeline import Pipeline, ReferenceMotion
+from jaximp.identification.regression import Filtered, Measured, Rows, measure, once, regress, rows_of
 from jaximp.identification.separation import METHODS, Regression, Separation, fit_robot, separate
-from jaximp.jobs.job import Job
-from jaximp.least_squares.sliding import Score, score, sliding_least_squares
+from jaximp.identification.windows import (
+    MOST_ROWS,
+    Placement,
+    Solved,
+    moments,
+    place_windows,
+    solve_stack,
+)
+from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models import Joints, Model, combine, pathway_of, with_gain
-from jaximp.signals import filters as signals
-from jaximp.trust.verdicts import Verdicts, fake_change_threshold, judge, worst
-from jaximp.types import AnyArray, Progress, Recording, nearest
+from jaximp.trust.verdicts import fake_change_threshold, judge, worst
+from jaximp.types import Progress, Recording, nearest
 
 CLEAR = 2.0
 """A reflex whose gain is so many standard errors from zero has a delay."""
 STILL = 1e-3
 """A window whose torque varies by a smaller share of the recording's variance can neither confirm nor refute."""
 
-ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
-"""Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
+def estimate(
+    pipeline: Pipeline,
+    recording: Recording,
+    alone: Recording | None = None,
+    progress: Progress = lambda share: None,
+) -> list[Estimates]:
+    """Identify a recording in all windows: one `Estimates` for each method (one where there is no pair).
 
-@dataclass(frozen=True)
-class Reflex:
-    """The reflex of one joint in all windows."""
-
-    name: str
-    """`reflex`; with several joints `joint1.reflex`."""
-    unit: str
-    """Of the gain and of the weights."""
-    lags: NDArray[np.float64]
-    """(k,) [s]."""
-    columns: NDArray[np.int64]
-    """(k,) where their weights stand among the parameters."""
-    gain: NDArray[np.float64]
-    """(M,) sum of the weights; above zero where the reflex resists the stretch."""
-    gain_stderr: NDArray[np.float64]
-    """(M,)."""
-    delay: NDArray[np.float64]
-    """(M,) mean lag by weight [s]; NaN where the gain is within two standard errors of zero."""
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """One model in all windows of one recording."""
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    window: float
-    """Length of the windows [s]."""
-    start: NDArray[np.float64]
-    """(M,) time of each window's first sample [s]."""
-    end: NDArray[np.float64]
-    """(M,) time of each window's last sample [s]."""
-    fit: SlidingFit
-    """Parameters, standard errors and condition of every window."""
-    held_out_vaf: NDArray[np.float64]
-    """(M,) how well each window's parameters predict the torque of the window after it."""
-    verdicts: Verdicts
-    threshold: float | None
-    """Threshold on the condition number, eq. (16), where a reference trajectory was given."""
-    time: NDArray[np.float64]
-    """(N,) time of the torque samples below [s]."""
-    torque: NDArray[np.float64]
-    """(N, n) torque that the model had to explain, filtered [N m]; NaN where it did not count."""
-    reconstructed: NDArray[np.float64]
-    """(N, n) the model's torque with the parameters of the window around each sample."""
-    predicted: NDArray[np.float64]
-    """(N, n) the model's torque with parameters that have not seen the sample: those of the last window that ended
-    before the block of one window's length in which the sample lies."""
-    method: int | None = None
-    """Which of the four methods told the human from the robot."""
-    robot: WindowFit | None = None
-    """The robot's parameters, where a method needed them."""
-    robot_names: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    """What a reader must know of these numbers, in plain words."""
-    reflexes: tuple[Reflex, ...] = ()
-    """Of every joint that has one."""
-
-    @property
-    def intrinsic(self) -> NDArray[np.int64]:
-        """Which parameters are no weights of a reflex."""
-        weights = [reflex.columns for reflex in self.reflexes]
-        return np.setdiff1d(np.arange(len(self.names)), np.concatenate([[], *weights]))
-
-    def summarised(self) -> Estimates:
-        """With the gain of every reflex in place of its weights: what a person wants to see of all parameters."""
-        if not self.reflexes:
-            return self
-        kept, gone = self.intrinsic, np.full((len(self.end), len(self.reflexes)), np.nan)
-        found = (
-            (self.fit.theta, np.stack([reflex.gain for reflex in self.reflexes], axis=1)),
-            (self.fit.stderr, np.stack([reflex.gain_stderr for reflex in self.reflexes], axis=1)),
-            (self.fit.excitation, gone),
-        )
-        columns = tuple(np.concatenate([np.asarray(x)[:, kept], gain], axis=1) for x, gain in found)
-        return replace(
-            self,
-            names=(*(self.names[k] for k in kept), *(f"{reflex.name}_gain" for reflex in self.reflexes)),
-            units=(*(self.units[k] for k in kept), *(reflex.unit for reflex in self.reflexes)),
-            fit=eqx.tree_at(lambda f: (f.theta, f.stderr, f.excitation), self.fit, columns),
-            reflexes=(),
-        )
-
-    def mean_over_trusted(self) -> NDArray[np.float64]:
-        """(p,) mean of each parameter over the trusted windows; NaN if there are none."""
-        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
-        return theta.mean(axis=0) if len(theta) else np.full(len(self.names), np.nan)
-
-    def sd_over_trusted(self) -> NDArray[np.float64]:
-        """(p,) standard deviation of each parameter over the trusted windows; NaN if there are none."""
-        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
-        return theta.std(axis=0) if len(theta) else np.full(len(self.names), np.nan)
-
-
-def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates]:
-    """Run a job: one `Estimates` per method (a job without a robot beside the human has one).
+    **Arguments:** `alone`, the recording of the robot without the human, where the pipeline has a robot.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
-    return identify_recording(job, job.load(), job.load_robot_alone(), progress)
-
-
-def identify_recording(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
-) -> list[Estimates]:
-    """As `identify`, for recordings that are in memory."""
-    prepared = prepare(job, recording, alone)
+    prepared = prepare(pipeline, recording, alone)
     progress(0.3)
-    return in_windows(job, prepared, lambda share: progress(0.3 + 0.7 * share))
+    return in_windows(prepared, lambda share: progress(0.3 + 0.7 * share))
 
 
 @dataclass(frozen=True)
@@ -168,133 +67,146 @@ class _Pair:
     loaded: Regression
 
 
-class Moments(NamedTuple):
-    """Of all rows that count, whatever the window."""
-
-    torque: AnyArray
-    """() variance [N^2 m^2]."""
-    columns: AnyArray
-    """(p,) mean squares."""
-
-    @property
-    def parameter_scale(self) -> NDArray[np.float64]:
-        """(p,) what each parameter would be if its column made all of the torque's variation by itself."""
-        size = np.sqrt(self.columns)
-        return np.sqrt(self.torque) / np.where(size > 0, size, np.inf)
-
-
-def moments(W: AnyArray, torque: AnyArray, valid: AnyArray) -> Moments:
-    """Of (N, *n, p) columns and (N, *n) torques, where they are valid; of JAX's arrays or numpy's."""
-    xp = jnp if isinstance(W, Array) else np
-    W, torque, valid = W.reshape(-1, W.shape[-1]), torque.ravel(), valid.ravel()
-    count = xp.maximum(valid.sum(), 1)
-    mean = xp.where(valid, torque, 0).sum() / count
-    variance = (xp.where(valid, torque - mean, 0) ** 2).sum() / count
-    return Moments(variance, (xp.where(valid[:, None], W, 0) ** 2).sum(axis=0) / count)
-
-
-class Solved(NamedTuple):
-    """What is found in the windows before it is judged."""
-
-    fit: SlidingFit
-    unseen: Score
-    """How well each window's parameters predict the torque of the window behind it."""
-    moments: Moments
-
-
 @dataclass(frozen=True)
 class Prepared:
     """A filtered recording: what windows of any length share (but for filters inside every window)."""
 
     recording: Recording
-    model: Model
-    """What is identified in the windows: the human where there is one, else the robot."""
-    filters: Filters
+    pipeline: Pipeline
     rows: Rows
-    noise: Array | None
-    """What the filters make of white torque noise, see `noise_of_rows`."""
     column_noise: NDArray[np.float64]
-    """(p,) what noise of the position leaves in each column."""
+    """(p,) root mean square of what noise of the position leaves in each column."""
     pair: _Pair | None
     reference: ReferenceMotion
     jumps: NDArray[np.bool_]
     """(N,) where the position jumps."""
     solved: tuple[Solved, ...] = ()
-    """One for each joint (of joints side by side), where the windows are solved already, many recordings at a time."""
+    """One for each joint (of joints side by side), where the windows of the pipeline are solved already."""
+
+    @property
+    def model(self) -> Model:
+        """What is identified in the windows."""
+        return self.pipeline.model
+
+    @property
+    def noise(self) -> Array | NDArray[np.float64] | None:
+        """What the filters make of white torque noise: by lag in rows, or for every pair of rows of a window."""
+        return noise_of(self.pipeline)
+
+    @property
+    def stackable(self) -> bool:
+        """Whether all its windows are solved in one call, by sums that they share."""
+        return can_be_stacked(self.pipeline) and len(self.rows.time) <= MOST_ROWS
 
 
-def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> Prepared:
-    """Filter the recordings of a job."""
-    robot, human, filters = checked_models(job, recording)
-    noise = noise_of_rows(job, recording, filters)
-    model = robot if human is None else human
-    assert model is not None
-    if robot is None or human is None:
-        rows, pair = regress(model, recording, job, filters), None
-    else:
-        rows, pair = _prepare_pair(job, recording, alone, robot, human, filters)
-    return Prepared(
-        recording, model, filters, rows, noise, column_noise(model, recording, job, filters), pair,
-        reference_motion(job, recording), jumped(recording),
-    )  # fmt: skip
+def can_be_stacked(pipeline: Pipeline) -> bool:
+    """Whether recordings go through together: a pair needs two at a time, a reflex a second fit for its gain."""
+    return pipeline.once and pipeline.robot is None and not pipeline.model.memory
 
 
-def checked_models(job: Job, recording: Recording) -> tuple[Model | None, Model | None, Filters]:
-    """Robot's and human's model and the filters, for a recording that suits the job."""
-    signals.require_float64(recording.position)
-    check_window(job, recording)
-    robot, human = job.models(recording.joints, recording.sample_rate)
-    if job.model.arm is not None:
-        _check_elbow(job, recording)
-    return robot, human, design_filters(job.filter, recording.sample_rate)
+def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
+    """What the filters make of white torque noise: by lag in rows, or for every pair of rows of a window."""
+    if pipeline.once or pipeline.filters.parallel is None:
+        return pipeline.filters.noise
+    return noise_in_windows(pipeline)
 
 
-def _check_elbow(job: Job, recording: Recording) -> None:
-    """A human's elbow does not turn further than half a turn; degrees that pass for radians do."""
-    assert job.model.arm is not None
-    farthest = float(np.nanmax(np.abs(recording.position[:, 1])))
-    if job.model.arm.equilibrium is not None and farthest > np.pi:
-        raise ValueError(
-            f"the elbow turns to {farthest:.3g} rad, more than half a turn: are these degrees? Give unit = 'deg'"
-        )
+def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = None) -> Prepared:
+    """Filter a recording, and that of the robot alone where there is a pair."""
+    if pipeline.robot is not None:
+        return _prepare_pair(pipeline, pipeline.robot, recording, alone)
+    measured = measure(pipeline, recording)
+    rows, noise = regress(measured)
+    if not pipeline.once:
+        rows = regress_in_windows(pipeline, recording, pipeline.model)
+    return _prepared(measured, rows, noise)
+
+
+def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
+    """A recording that was filtered with others, as `prepare` has it.
+
+    **Raises:** `ValueError` where no sample is left.
+    """
+    return _prepared(measured, *rows_of(measured, found, k))
+
+
+def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: _Pair | None = None) -> Prepared:
+    recording, pipeline = measured.recording, measured.pipeline
+    return Prepared(recording, pipeline, rows, noise, pair, pipeline.reference_motion(recording), measured.jumps)
+
+
+def solve_windows(
+    several: Sequence[Prepared], padded: int | None = None, stacked: int = 1, longest: float | None = None
+) -> list[Prepared]:
+    """All windows of recordings that were filtered alike, joint by joint, in one call each.
+
+    **Arguments:** `padded` rows to which each is filled up, in a stack of so many; `longest` [s], where other lengths
+    of up to so much follow: they will share the compiled code.
+    """
+    first = several[0]
+    padded = len(first.rows.time) if padded is None else padded
+    noise, found = [one.pipeline.filters.noise for one in several], []
+    for columns in _columns_by_joint(first.model):
+        own = [one.rows if columns is None else one.rows.of_joint(*columns) for one in several]
+        found.append(solve_stack(own, noise, place_windows(first.pipeline, own[0], longest), padded, stacked))
+    return [replace(one, solved=solved) for one, solved in zip(several, zip(*found, strict=True), strict=True)]
+
+
+def _columns_by_joint(model: Model) -> list[tuple[int, slice] | None]:
+    """Which parameters are those of each joint of joints side by side; None stands for all of another model."""
+    if not isinstance(model, Joints):
+        return [None]
+    ends = np.cumsum([len(part.names) for part in model.models]).tolist()
+    return [(j, slice(first, end)) for j, (first, end) in enumerate(zip([0, *ends], ends, strict=False))]
 
 
 def in_windows(
-    job: Job,
     prepared: Prepared,
     progress: Progress = lambda share: None,
     longest: float | None = None,
     curves: bool = True,
 ) -> list[Estimates]:
-    """Solve (where that is not done yet) and judge every window of a prepared recording, by every method of the job.
+    """Solve (where that is not done yet) and judge every window of a prepared recording, by every method.
 
     **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code;
     `curves` whether the torques over time are wanted, which only figures need.
     """
+    if not prepared.solved and prepared.stackable:
+        prepared = solve_windows([prepared], longest=longest)[0]
     if isinstance(prepared.model, Joints):
-        return [_joint_by_joint(job, prepared, progress, longest, curves)]
-    rows, noise = prepared.rows, prepared.noise
-    place = windows_in_rows(job, prepared.recording, rows, prepared.filters, longest)
+        return [_joint_by_joint(prepared, prepared.model, progress, longest, curves)]
+    rows = prepared.rows
+    place = place_windows(prepared.pipeline, rows, longest)
     if prepared.solved:
-        return [_estimates(job, prepared, rows, prepared.solved[0], place, curves=curves)]
-    if prepared.pair is None:
-        valid = jnp.asarray(rows.valid)
+        return [_estimates(prepared, rows, prepared.solved[0], place, curves=curves)]
+    if prepared.pair is not None:
+        return _by_methods(prepared, prepared.pair, place, progress, curves)
 
-        def solve(W: Array) -> SlidingFit:
-            return sliding_least_squares(
-                W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=place.room
-            )
+    def solve(W: Array) -> SlidingFit:
+        valid, noise = jnp.asarray(rows.valid), prepared.noise
+        return sliding_least_squares(
+            W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=_room(place)
+        )
 
-        fit = solve(rows.W)
-        gain = solve(with_gain(prepared.model, rows.W)) if prepared.model.memory else None
-        return [_estimates(job, prepared, rows, _predict(rows, fit, place), place, gain=gain, curves=curves)]
-    pair = prepared.pair
+    W = jnp.asarray(rows.W)
+    fit = solve(W)
+    gain = solve(with_gain(prepared.model, W)) if prepared.model.memory else None
+    return [_estimates(prepared, rows, _predict(rows, fit, place), place, gain=gain, curves=curves)]
+
+
+def _room(place: Placement) -> int | None:
+    return None if place.separate else place.room
+
+
+def _by_methods(prepared: Prepared, pair: _Pair, place: Placement, progress: Progress, curves: bool) -> list[Estimates]:
+    """The human in the robot, by every method that is asked for."""
+    rows, noise, methods = prepared.rows, prepared.noise, prepared.pipeline.methods
     merge = combine(pair.robot, prepared.model).merge
     results = []
-    for count, method in enumerate(job.model.methods):
+    for count, method in enumerate(methods):
 
         def solve_pair(alone: Regression, loaded: Regression, method: int = method) -> Separation:
-            return separate(method, pair.robot_fit, alone, loaded, merge, place.window, place.step, noise, place.room)
+            return separate(method, pair.robot_fit, alone, loaded, merge, place.window, place.step, noise, _room(place))
 
         found, gain = solve_pair(pair.alone, pair.loaded), None
         if prepared.model.memory:
@@ -304,35 +216,33 @@ def in_windows(
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
         solved = _predict(human, found.fit, place)
         notes = (METHODS[method], found.warning)
-        estimates = _estimates(job, prepared, human, solved, place, method, *notes, gain=gain, curves=curves)
+        estimates = _estimates(prepared, human, solved, place, method, *notes, gain=gain, curves=curves)
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
-        progress((count + 1) / len(job.model.methods))
+        progress((count + 1) / len(methods))
     return results
 
 
-def _joint_by_joint(job: Job, prepared: Prepared, progress: Progress, longest: float | None, curves: bool) -> Estimates:
+def _joint_by_joint(
+    prepared: Prepared, model: Joints, progress: Progress, longest: float | None, curves: bool
+) -> Estimates:
     """Joints side by side share no parameter and no noise: each is solved and judged by itself."""
-    assert isinstance(prepared.model, Joints)
-    for name in job.trust.parameters:
-        if name not in prepared.model.names:
-            hint = nearest(name, list(prepared.model.names))
+    for name in prepared.pipeline.limits.parameters:
+        if name not in model.names:
+            hint = nearest(name, list(model.names))
             raise ValueError(f"trust.parameters has an unknown parameter '{name}': {hint}")
-    parts, first = [], 0
-    for j, model in enumerate(prepared.model.models):
-        columns = slice(first, first + len(model.names))
-        tag = f"joint{j + 1}."
-        chosen = tuple(name.removeprefix(tag) for name in job.trust.parameters if name.startswith(tag))
-        alone = replace(job, trust=replace(job.trust, parameters=chosen))
-        one = _one_joint(prepared, j, model, columns)
-        parts.append(in_windows(alone, one, longest=longest, curves=curves)[0])
-        first = columns.stop
-        progress((j + 1) / len(prepared.model.models))
-    return _side_by_side(prepared.model, parts)
+    parts = []
+    for place in filter(None, _columns_by_joint(model)):
+        one = _one_joint(prepared, model, *place)
+        parts.append(in_windows(one, longest=longest, curves=curves)[0])
+        progress(len(parts) / len(model.models))
+    return _side_by_side(model, parts)
 
 
-def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prepared:
+def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Prepared:
     """The share of one joint in a prepared recording of several."""
-    recording, rows, this = prepared.recording, prepared.rows, slice(j, j + 1)
+    recording, pipeline, this = prepared.recording, prepared.pipeline, slice(j, j + 1)
+    tag = f"joint{j + 1}."
+    chosen = tuple(name.removeprefix(tag) for name in pipeline.limits.parameters if name.startswith(tag))
     return replace(
         prepared,
         recording=replace(
@@ -341,8 +251,8 @@ def _one_joint(prepared: Prepared, j: int, model: Model, columns: slice) -> Prep
             torque=recording.torque[:, this],
             joints=recording.joints[this],
         ),
-        model=model,
-        rows=Rows(rows.W[:, j, columns], rows.torque[:, j], rows.valid[:, j], rows.time),
+        pipeline=replace(pipeline, model=model.models[j], limits=replace(pipeline.limits, parameters=chosen)),
+        rows=prepared.rows.of_joint(j, columns),
         column_noise=prepared.column_noise[columns],
         reference=_of_joint(prepared.reference, this),
         solved=prepared.solved[this],
@@ -405,24 +315,26 @@ def _reflexes_side_by_side(parts: list[Estimates]) -> Iterator[Reflex]:
 
 
 def at_other_lengths(
-    job: Job,
     prepared: Prepared,
     alone: Recording | None = None,
     factors: tuple[float, ...] = (0.5, 2.0),
     progress: Progress = lambda share: None,
 ) -> list[Estimates]:
-    """The same data with shorter and longer windows, so that the choice of a length can be seen.
+    """The same data with shorter and longer windows, by the first method, so that the choice of a length can be seen.
 
     Lengths that the recording or the filters do not allow are left out.
     """
+    length = prepared.pipeline.window.length
 
     def identified(factor: float) -> list[Estimates]:
-        window = replace(job.window, length=factor * job.window.length, step=step_seconds(job))
-        other = replace(job, window=window, model=replace(job.model, methods=job.model.methods[:1]))
+        other = prepared.pipeline.with_window(factor * length)
+        other = replace(other, methods=other.methods[:1])
         with suppress(ValueError):
-            once = job.filter.mode == "once"
-            shared = prepared if once else prepare(other, prepared.recording, alone)
-            return in_windows(other, shared, longest=max(factors) * job.window.length)
+            other.check(prepared.recording)
+            shared = replace(prepared, pipeline=other, solved=())
+            if not other.once:
+                shared = prepare(other, prepared.recording, alone)
+            return in_windows(shared, longest=max(factors) * length)
         return []
 
     found = []
@@ -432,28 +344,33 @@ def at_other_lengths(
     return found
 
 
-def regress_both(
-    robot: Model, human: Model, recording: Recording, job: Job, filters: Filters
-) -> tuple[Regression, Rows]:
-    """Rows of the robot's and of the human's model for one recording, apart and stacked."""
-    rows = regress(robot + human, recording, job, filters)
+def regress_pair(
+    pipeline: Pipeline, robot: Model, recording: Recording
+) -> tuple[Regression, Rows, NDArray[np.float64], Measured]:
+    """Rows of the robot's and of the human's model for one recording, apart and stacked, and the columns' noise."""
+    both = robot + pipeline.model
+    measured = measure(pipeline, recording, both)
+    rows, noise = regress(measured)
+    if not pipeline.once:
+        rows = regress_in_windows(pipeline, recording, both)
     n = len(robot.names)
-    return Regression(rows.W[:, :n], rows.W[:, n:], rows.torque, jnp.asarray(rows.valid)), rows
+    W, torque = jnp.asarray(rows.W), jnp.asarray(rows.torque)
+    return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, noise, measured
 
 
-def _prepare_pair(
-    job: Job, recording: Recording, alone: Recording | None, robot: Model, human: Model, filters: Filters
-) -> tuple[Rows, _Pair]:
+def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone: Recording | None) -> Prepared:
     alone = _checked_pair(recording, alone)
     # The robot's own parameters come from its whole recording, which needs no windows.
-    once = replace(job, filter=replace(job.filter, mode="once"))
-    whole = regress_both(robot, human, alone, once, filters)[0]
-    robot_fit = fit_robot(whole, noise_of_rows(once, alone, filters))
+    whole_record = once(pipeline)
+    whole = regress_pair(whole_record, robot, alone)[0]
+    noise = noise_of(whole_record)
+    robot_fit = fit_robot(whole, None if noise is None else jnp.asarray(noise))
     # Methods 1 and 2 need no windows of the robot alone.
-    shared = job.filter.mode == "once" or not {3, 4}.intersection(job.model.methods)
-    in_windows = whole if shared else regress_both(robot, human, alone, job, filters)[0]
-    loaded, rows = regress_both(robot, human, recording, job, filters)
-    return rows, _Pair(robot, robot_fit, in_windows, loaded)
+    shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
+    in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
+    loaded, rows, column_noise, measured = regress_pair(pipeline, robot, recording)
+    pair = _Pair(robot, robot_fit, in_windows, loaded)
+    return _prepared(measured, rows, column_noise[len(robot.names) :], pair)
 
 
 def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
@@ -473,12 +390,11 @@ def _predict(rows: Rows, fit: SlidingFit, place: Placement) -> Solved:
     """Hold every window's parameters against the window behind it."""
     ahead = place.next_starts[: len(fit.last)]
     valid = jnp.asarray(rows.valid)
-    unseen = score(rows.W, rows.torque, valid, fit.theta, ahead, place.window, place.step, place.room)
+    unseen = score(rows.W, rows.torque, valid, fit.theta, ahead, place.window, place.step, _room(place))
     return Solved(fit, unseen, moments(*(np.asarray(x) for x in (rows.W, rows.torque, rows.valid))))
 
 
 def _estimates(
-    job: Job,
     prepared: Prepared,
     rows: Rows,
     solved: Solved,
@@ -489,18 +405,18 @@ def _estimates(
     curves: bool = True,
 ) -> Estimates:
     """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
-    recording, model = prepared.recording, prepared.model
+    recording, pipeline, model = prepared.recording, prepared.pipeline, prepared.model
     fit, unseen, whole = solved
     starts = place.starts[: len(fit.last)]
     held_out = np.where(np.asarray(unseen.variance) > STILL * whole.torque, np.asarray(unseen.vaf), np.nan)
     if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
         valid = jnp.asarray(rows.valid)
-        seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, place.room)
+        seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, _room(place))
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
-    threshold, why_not = _threshold(job, prepared, place, method)
+    threshold, why_not = _threshold(prepared, place, method)
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
-    limits = job.trust
+    limits = pipeline.limits
     if reflexes and not limits.parameters:
         # Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one.
         limits = replace(limits, parameters=tuple(np.delete(model.names, reflexes[0].columns).tolist()))
@@ -519,7 +435,7 @@ def _estimates(
     return Estimates(
         names=model.names,
         units=model.units,
-        window=job.window.length,
+        window=pipeline.window.length,
         start=rows.time[starts],
         end=rows.time[np.asarray(fit.last)],
         fit=fit,
@@ -532,7 +448,7 @@ def _estimates(
         predicted=predicted,
         notes=(
             *recording.notes,
-            *filter(None, (jumps, _literal_note(job), why_not, *notes)),
+            *filter(None, (jumps, _literal_note(pipeline), why_not, *notes)),
             *(_reflex_note(reflex, verdicts.trusted) for reflex in reflexes),
         ),
         reflexes=reflexes,
@@ -570,10 +486,10 @@ def jump_note(recording: Recording, jumps: NDArray[np.bool_]) -> str:
     return f"the position jumps ({where}), as no joint can move: the samples around that are left out"
 
 
-def _literal_note(job: Job) -> str:
-    if job.filter.mode == "once":
+def _literal_note(pipeline: Pipeline) -> str:
+    if pipeline.once:
         return ""
-    dropped = job.filter.drop_transient
+    dropped = pipeline.filter.drop_transient
     measured = "0.1 (the ends are left out)" if dropped else "2 (filter.drop_transient = true leaves the ends out)"
     return (
         "the filters ran inside every window, where position and torque do not pass the same filters near the ends: "
@@ -581,7 +497,7 @@ def _literal_note(job: Job) -> str:
     )
 
 
-def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | None) -> tuple[float | None, str]:
+def _threshold(prepared: Prepared, place: Placement, method: int | None) -> tuple[float | None, str]:
     """Threshold of eq. (16), or why it is not applied."""
     if method in (2, 4):
         return None, (
@@ -593,28 +509,8 @@ def _threshold(job: Job, prepared: Prepared, place: Placement, method: int | Non
     q, dq, ddq = (x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
     rate = prepared.recording.sample_rate
     W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))
-    window = round(job.window.length * rate * place.counted / place.window)
+    window = round(prepared.pipeline.window.length * rate * place.counted / place.window)
     return float(fake_change_threshold(np.asarray(W), len(q), window)), ""
-
-
-def reference_motion(job: Job, recording: Recording) -> ReferenceMotion:
-    """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
-    rate, series = recording.sample_rate, job.load_design()
-    if series is not None:
-        q, dq, ddq = (x.reshape(len(x), -1) for x in series(jnp.arange(round(float(series.period) * rate)) / rate))
-        if q.shape[1] != recording.n_joints:
-            raise ValueError(f"{job.design} moves {q.shape[1]} joints, but the recording has {recording.n_joints}")
-        return q, dq, ddq
-    if recording.reference is None or job.reference_period is None:
-        missing = "reference position" if recording.reference is None else "reference_period"
-        return (
-            f"no {missing} was given, so the threshold for fake changes (Tout et al. 2023, eq. 16; for periodic "
-            "reference motions) is not applied"
-        )
-    reference = recording.reference[: round(job.reference_period * rate)]
-    if len(reference) < round(job.reference_period * rate) or not np.isfinite(reference).all():
-        return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
-    return reference, *signals.central_differences(reference, rate)
 
 
 def _reconstruct(

@@ -14,53 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design.files import read_trajectory
+from jaximp.identification.filters import FilterSettings
+from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import HandArmSettings, TrialsSettings, arm_settings, trials_settings
 from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
 from jaximp.motion.trajectories import FourierSeries
+from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping
 from jaximp.trust.verdicts import TrustLimits
 from jaximp.types import Recording
-
-
-@dataclass(frozen=True)
-class FilterSettings:
-    """Filters of Tout et al. 2023, III-B; all are Butterworth filters run forward and backward."""
-
-    position_cutoff: float | None = None
-    """Low-pass of the position before it is differentiated [Hz]; the paper's f_c, above ten natural frequencies. The
-    torque does not pass it, so whatever it takes off the motion biases the estimates: leave room above the motion."""
-    position_order: int = 8
-    decimation_cutoff: float | None = None
-    """Low-pass of the torque and of every column of the regressor [Hz]; the paper's f_cd, above two natural
-    frequencies."""
-    decimation_order: int = 4
-    high_pass: float | None = None
-    """High-pass of the torque and of every column [Hz], which takes slow drift out of both sides."""
-    high_pass_order: int = 2
-    decimate: int | None = None
-    """Keep every n-th sample after the filters; by default five samples per period of `decimation_cutoff`."""
-    mode: str = "once"
-    """`once` filters the recording and then slides; `window` filters inside every window, as the paper writes."""
-    drop_transient: bool = True
-    """With `mode = "window"`: leave out the rows at both ends of the window that its edges disturb. Kept, they biased
-    the inertia by 2.2 standard deviations on the simulated rig; left out, by 0.1 (experiments/coverage.py)."""
-    measured_derivatives: bool = False
-    """Use the recording's velocity (and acceleration, where it has one) in place of differences of the position."""
-
-
-@dataclass(frozen=True)
-class WindowSettings:
-    """Windows and the samples that count in them."""
-
-    length: float
-    """Length of the sliding window [s]."""
-    step: float | None = None
-    """From one window to the next [s]; by default a fiftieth of the length."""
-    min_velocity: float = 0.0
-    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
 
 
 @dataclass(frozen=True)
@@ -164,19 +129,6 @@ class ModelSettings:
 
 
 @dataclass(frozen=True)
-class PosteriorSettings:
-    """`[posterior]`: what posteriors are drawn with."""
-
-    seed: int = 0
-    ess: float = 1000.0
-    """Effective samples of every parameter."""
-    heavy_tails: bool = False
-    """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
-    prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)
-    """Of parameters by name: `{ mean = 60, sd = 20 }`, or `{ median = 0.7, factor = 2 }` of one that is positive."""
-
-
-@dataclass(frozen=True)
 class Job:
     """Everything that `identify` needs to know."""
 
@@ -241,6 +193,27 @@ class Job:
                 )
             return self.model.arm.make(), None
         return _side_by_side(robot, joints, sample_rate), _side_by_side(human, joints, sample_rate)
+
+    def pipeline(self, joints: tuple[str, ...], sample_rate: float) -> Pipeline:
+        """What is done with every recording of these joints and this sample rate [Hz]."""
+        robot, human = self.models(joints, sample_rate)
+        model = robot if human is None else human
+        if model is None:
+            raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
+        return Pipeline(
+            sample_rate=sample_rate,
+            model=model,
+            window=self.window,
+            filter=self.filter,
+            limits=self.trust,
+            robot=None if human is None else robot,
+            methods=self.model.methods,
+            reference=self.load_design() or self.reference_period,
+        )
+
+    def pipeline_for(self, recording: Recording) -> Pipeline:
+        """What is done with this recording."""
+        return self.pipeline(recording.joints, recording.sample_rate)
 
 
 @lru_cache(maxsize=64)

@@ -75,8 +75,8 @@ class Plan(NamedTuple):
     """Whether rows have weights: then they are not their own count."""
     lags: int = 0
     """Lags of the noise's autocovariance, none for white noise; a window has at least `2 reach` rows."""
-    ahead: int = 0
-    """Windows from one to that which it is held against (`Unseen`); none if nothing is to be predicted."""
+    predicts: bool = False
+    """Whether every window is held against a later one (`Unseen`)."""
 
     @property
     def reach(self) -> int:
@@ -139,7 +139,7 @@ class Statistics(NamedTuple):
 
 
 class Unseen(NamedTuple):
-    """How well each window predicts the one `plan.ahead` windows on; (K,), nothing where that is beyond the chunk."""
+    """How well each window predicts the one `ahead` windows on; (K,), nothing where that is beyond the chunk."""
 
     vaf: Array
     samples: Array
@@ -147,12 +147,20 @@ class Unseen(NamedTuple):
     """Of the torque there."""
 
 
-def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, noise: Array | None = None) -> ChunkFit:
+def solve_chunk(
+    plan: Plan,
+    columns: Array,
+    scale: Array,
+    window: Array | int,
+    noise: Array | None = None,
+    ahead: Array | int = 0,
+) -> ChunkFit:
     """Fit every window of a chunk.
 
     **Arguments:** `columns` (p + 1, rows) of W and y, with the rows of several outputs in turn, multiplied by `scale`
     (rows,): zero where a row does not count, else the root of its weight; `window` its length in rows, at most
-    `plan.room` blocks; `noise` (lags,) its autocovariance.
+    `plan.room` blocks; `noise` (lags,) its autocovariance; `ahead`, how many windows on the one lies that each is held
+    against, where the plan `predicts`.
     """
     p = len(columns) - 1
     features, R = _features(plan, columns, scale, noise)
@@ -187,12 +195,12 @@ def solve_chunk(plan: Plan, columns: Array, scale: Array, window: Array | int, n
     state = first, _diagonal(first, p), outside
     if plan.per_block == 1:
         found, later = jax.tree.map(lambda x: x[None], solve(*state, 0))
-        return _in_given_units(_with_unseen(found, later, R, plan), R, plan)
+        return _in_given_units(_with_unseen(found, later, R, plan, ahead), R, plan)
     leaving, entering = (
         x[:, :, : plan.lanes].reshape(plan.per_block, plan.step, len(features), plan.lanes) for x in (blocked, tail)
     )
     found, later = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
-    return _in_given_units(_with_unseen(found, later, R, plan), R, plan)
+    return _in_given_units(_with_unseen(found, later, R, plan, ahead), R, plan)
 
 
 class Wanted(NamedTuple):
@@ -589,19 +597,19 @@ def _one_after_another(x: Array, plan: Plan) -> Array:
 
 def _for_prediction(sums: Rows, p: int, plan: Plan) -> Array:
     """The sums by which other parameters are held against a window, (k, lanes)."""
-    if not plan.ahead:
+    if not plan.predicts:
         return jnp.zeros((0, sums[0].shape[-1]), sums[0].dtype)
     return keep(jnp.concatenate(sums[: p + 2 + plan.outputs + plan.weighted]))
 
 
-def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan) -> ChunkFit:
+def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan, ahead: Array | int) -> ChunkFit:
     """Hold every window's parameters, in the chunk's coordinates, against the sums of a later one."""
     p = len(R) - 1
-    if not plan.ahead:
+    if not plan.predicts:
         return found
     assert plan.statistics
     sizes = [*range(p + 1, 0, -1), 1, *[p + 2 + plan.outputs] * plan.outputs, *[1] * plan.weighted]
-    later = jnp.roll(_one_after_another(sums, plan), -plan.ahead, axis=0).T
+    later = jnp.roll(_one_after_another(sums, plan), -ahead, axis=0).T
     rows = tuple(jnp.split(keep(later), np.cumsum(sizes)[:-1]))
     inner = list(keep(_one_after_another(found.theta, plan).T))
     # The residual is this combination of the chunk's columns; its sum of squares, a quadratic form of theirs.
@@ -613,7 +621,7 @@ def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan) -> ChunkFit
     )
     rss = R[p, p] ** 2 * jnp.maximum(square, 0)
     _, vaf, total, samples = _residuals(plan, rss, inner, R, rows)
-    whole = jnp.arange(plan.windows) < plan.windows - plan.ahead
+    whole = jnp.arange(plan.windows) < plan.windows - ahead
     unseen = Unseen(jnp.where(whole, vaf, jnp.nan), jnp.where(whole, samples, 0), total / jnp.maximum(samples, 1))
     back = tuple(x.reshape(plan.lanes, plan.per_block).T for x in unseen)
     return found._replace(unseen=Unseen(*back))

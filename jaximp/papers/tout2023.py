@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identification.identify import Estimates, identify_recording, regress_both
-from jaximp.identification.regression import design_filters, noise_of_rows
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.filters import FilterSettings
+from jaximp.identification.identify import estimate, noise_of, regress_pair
+from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import fit_robot
-from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
 from jaximp.least_squares.recursive import recursive_least_squares
 from jaximp.least_squares.window import variance_accounted_for
-from jaximp.simulation.rig import ROBOT_TRAJECTORY, ElasticBands, HumanLoad
+from jaximp.models import HumanJoint, RobotJoint
+from jaximp.simulation.rig import ROBOT_TRAJECTORY, ElasticBands, HumanLoad, Rig
 from jaximp.simulation.rig_recordings import rig_recordings
 from jaximp.types import Progress, Recording
 
@@ -117,16 +119,17 @@ WHY = (
 """What a reader must know who compares the two columns."""
 
 
-def _job(offset: bool, length: float, methods: tuple[int, ...] = (1,), mode: str = "window") -> Job:
-    return Job(
-        recording={},
-        robot_recording={},
-        model=ModelSettings(HumanSettings(offset, GEAR_RATIO), RobotSettings(GEAR_RATIO), methods=methods),
+def _pipeline(offset: bool, length: float, methods: tuple[int, ...] = (1,), mode: str = "window") -> Pipeline:
+    return Pipeline(
+        sample_rate=Rig().sample_rate,
+        model=HumanJoint(offset, GEAR_RATIO),
+        robot=RobotJoint(GEAR_RATIO),
+        methods=methods,
         window=WindowSettings(length, step=0.02, min_velocity=0.1),
         filter=FilterSettings(
             position_cutoff=10.0, decimation_cutoff=5.0, mode=mode, drop_transient=False, decimate=40
         ),
-        reference_period=10.0,
+        reference=10.0,
     )
 
 
@@ -138,7 +141,7 @@ def _identify(
     mode: str = "window",
 ) -> list[Estimates]:
     alone, held = recordings
-    return identify_recording(_job(offset, length, methods, mode), held, alone)
+    return estimate(_pipeline(offset, length, methods, mode), held, alone)
 
 
 @dataclass(frozen=True)
@@ -159,14 +162,11 @@ def _recursive(recordings: tuple[Recording, Recording], offset: bool, forgetting
 def _human_rows(recordings: tuple[Recording, Recording], offset: bool) -> tuple[Numbers, Numbers, Any, Numbers]:
     """Rows of the human's model and its torque by method 1, filtered once, at every sample."""
     alone, held = recordings
-    job = _job(offset, 2.0, mode="once")
-    job = replace(job, filter=replace(job.filter, decimate=1))
-    robot, human = job.models(held.joints, held.sample_rate)
-    assert robot is not None
-    assert human is not None
-    filters = design_filters(job.filter, held.sample_rate)
-    fit = fit_robot(regress_both(robot, human, alone, job, filters)[0], noise_of_rows(job, alone, filters))
-    loaded = regress_both(robot, human, held, job, filters)[0]
+    pipeline = _pipeline(offset, 2.0, mode="once")
+    pipeline = replace(pipeline, filter=replace(pipeline.filter, decimate=1))
+    robot, noise = RobotJoint(GEAR_RATIO), noise_of(pipeline)
+    fit = fit_robot(regress_pair(pipeline, robot, alone)[0], None if noise is None else jnp.asarray(noise))
+    loaded = regress_pair(pipeline, robot, held)[0]
     torque = loaded.torque - loaded.robot @ fit.theta
     return np.asarray(loaded.human), np.asarray(torque), np.asarray(loaded.valid), held.time
 

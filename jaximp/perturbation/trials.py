@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.design.objectives import solve_gram
-from jaximp.identification.regression import design_filters, filtered
-from jaximp.jobs.job import FilterSettings
+from jaximp.identification.filters import FilterSettings, design_filters
+from jaximp.identification.regression import filtered
 from jaximp.least_squares.window import WindowFit, least_squares, variance_accounted_for
 from jaximp.models import ArmGeometry, PlanarArm, solve_pair
 from jaximp.perturbation.movement_trials import NOISE, check_directions, check_hand, find_onset, trial_name

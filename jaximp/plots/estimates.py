@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from jaximp.identification.identify import Estimates
+from jaximp.identification.estimates import Estimates
 from jaximp.identification.separation import METHODS
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.joint import parameter_units

@@ -7,8 +7,8 @@ position is corrected for where it matters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -18,8 +18,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from jaximp.identification.identify import Prepared, in_windows, prepare
-from jaximp.identification.regression import Placement, noisy_columns, windows_in_rows
-from jaximp.jobs.job import Job
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.windows import Placement, place_windows
 from jaximp.least_squares.noise import (
     LAGS,
     Noise,
@@ -36,10 +36,8 @@ from jaximp.least_squares.noise import (
     whiteness,
 )
 from jaximp.models import Joints, Model, pathway_of
-from jaximp.perturbation.impedance import ArmImpedance, identify_trials
 from jaximp.posterior.densities import (
     Density,
-    estimate_density,
     linear_density,
     noise_names,
     undetermined,
@@ -47,7 +45,7 @@ from jaximp.posterior.densities import (
 )
 from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_posterior, probability_greater, stacked
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
-from jaximp.posterior.priors import MultivariateNormal, Prior, make_prior
+from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
 from jaximp.signals.filters import require_float64
 from jaximp.trust.verdicts import TRUSTED, Verdicts
@@ -57,6 +55,19 @@ CONTRADICTION = 1e-3
 """Windows, or estimates, that differ more than this is probable contradict each other."""
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Of the bands of torque."""
+
+
+@dataclass(frozen=True)
+class PosteriorSettings:
+    """`[posterior]`: what posteriors are drawn with."""
+
+    seed: int = 0
+    ess: float = 1000.0
+    """Effective samples of every parameter."""
+    heavy_tails: bool = False
+    """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
+    prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)
+    """Of parameters by name: `{ mean = 60, sd = 20 }`, or `{ median = 0.7, factor = 2 }` of one that is positive."""
 
 
 @dataclass(frozen=True)
@@ -215,28 +226,27 @@ class Inference:
         )
 
 
-def infer(job: Job, progress: Progress = lambda share: None) -> Inference:
-    """Posteriors of a job with a recording.
+def posterior_of(
+    pipeline: Pipeline,
+    settings: PosteriorSettings,
+    recording: Recording,
+    alone: Recording | None = None,
+    progress: Progress = lambda share: None,
+) -> Inference:
+    """Posteriors of a recording: of its whole record, and of windows that share no sample.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy: filters inside every window, parameters
     that the data leave undetermined, an impossible prior, and as `prepare`.
     """
-    return infer_recording(job, job.load(), job.load_robot_alone(), progress)
-
-
-def infer_recording(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
-) -> Inference:
-    """As `infer`, for recordings that are in memory."""
     require_float64(recording.position)
-    if job.filter.mode != "once":
+    if not pipeline.once:
         raise ValueError("posteriors need filters that run over the recording once: set filter.mode = 'once'")
-    prepared = prepare(job, recording, alone)
-    data = _data(job, prepared)
+    prepared = prepare(pipeline, recording, alone)
+    data = _data(settings, prepared)
     progress(0.2)
     whole = data.posterior()
     progress(0.5)
-    place, verdicts = _judged(job, prepared)
+    place, verdicts = _judged(prepared)
     windows, start, left_out = data.windows(place.starts, place.window)
     progress(0.9)
     left = residuals(data.white, optimum(data.white))
@@ -257,7 +267,7 @@ def infer_recording(
         prior=prior_predictive(data.prior, data.W[data.valid], data.y[data.valid]),
         time=time,
         torque=np.where(data.valid.reshape(y.shape), y, np.nan),
-        bands=torque_bands(whole.samples, data.W, LEVELS, heavy_tails=job.posterior.heavy_tails).reshape(
+        bands=torque_bands(whole.samples, data.W, LEVELS, heavy_tails=settings.heavy_tails).reshape(
             len(LEVELS), *y.shape
         ),
         notes=recording.notes,
@@ -288,22 +298,6 @@ def _counted(scores: Numbers) -> Numbers:
     return np.nansum(scores[np.isfinite(scores).any(axis=1)], axis=1)
 
 
-def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[ArmImpedance, Posterior]:
-    """An arm's damping and stiffness from a job with `[trials]`: the estimate, and draws of D11 to K22 around it.
-
-    Student's t with the estimate's covariance and degrees of freedom, within positive definite stiffnesses.
-
-    **Raises:** `ValueError` for an estimate without standard errors, and as `identify_trials`.
-    """
-    found = identify_trials(job, lambda share: progress(0.8 * share)).main
-    if not np.isfinite(found.covariance).all():
-        raise ValueError(f"the impedance has no standard errors, and so no posterior: {found.reason}")
-    density = estimate_density(found.names, found.units, found.theta, found.covariance, found.dof)
-    drawn = sample_posterior(density, ess=job.posterior.ess, seed=job.posterior.seed)
-    progress(1.0)
-    return found, derive(drawn, density.elements, density.element_names, density.element_units)
-
-
 def sentences(posterior: Posterior, names: Sequence[str]) -> list[str]:
     """What a paper says of each parameter: median and 95 % credible interval."""
     lines = []
@@ -318,7 +312,7 @@ def sentences(posterior: Posterior, names: Sequence[str]) -> list[str]:
 class _Data:
     """Rows of one model, and what is known besides them."""
 
-    job: Job
+    settings: PosteriorSettings
     model: Model
     W: Numbers
     """(N, *n, p)"""
@@ -357,7 +351,7 @@ class _Data:
 
     @property
     def is_exact(self) -> bool:
-        return len(self.white.count) == 1 and not any(self.prior.proper) and not self.job.posterior.heavy_tails
+        return len(self.white.count) == 1 and not any(self.prior.proper) and not self.settings.heavy_tails
 
     def within(self, rows: slice) -> _Data:
         """A part of the record, with noise of its own."""
@@ -367,9 +361,9 @@ class _Data:
     def posterior(self) -> Posterior:
         """Of all rows."""
         if self.is_exact:
-            return self._exact(self.white, jax.random.key(self.job.posterior.seed))
+            return self._exact(self.white, jax.random.key(self.settings.seed))
         density = self._density(self.white)
-        return sample_posterior(density, ess=self.job.posterior.ess, seed=self.job.posterior.seed)
+        return sample_posterior(density, ess=self.settings.ess, seed=self.settings.seed)
 
     def _exact(self, rows: WhiteRows, key: jax.Array) -> Posterior:
         given, names, units = triangles(rows, self.column_noise)[0], self.model.names, self.model.units
@@ -377,10 +371,10 @@ class _Data:
         if why:
             raise ValueError(why)
         exact = exact_posterior(given, float(rows.count[0]), names, units)
-        return exact.posterior(key, round(4 * self.job.posterior.ess))
+        return exact.posterior(key, round(4 * self.settings.ess))
 
     def _density(self, rows: WhiteRows) -> Density:
-        heavy = self.job.posterior.heavy_tails
+        heavy = self.settings.heavy_tails
         column_noise = None if heavy else self.column_noise
         names, units = self.model.names, self.model.units
         return linear_density(names, units, rows, self.prior, heavy_tails=heavy, column_noise=column_noise)
@@ -395,7 +389,7 @@ class _Data:
         return drawn, kept, without
 
     def _exact_windows(self, parts: Sequence[WhiteRows]) -> tuple[PosteriorMany | None, list[str]]:
-        key, drawn, reasons = jax.random.key(self.job.posterior.seed + 1), [], [""] * len(parts)
+        key, drawn, reasons = jax.random.key(self.settings.seed + 1), [], [""] * len(parts)
         for k, rows in enumerate(parts):
             try:
                 drawn.append(self._exact(rows, jax.random.fold_in(key, k)))
@@ -404,7 +398,7 @@ class _Data:
         return (stacked(drawn) if drawn else None), reasons
 
     def _sampled_windows(self, parts: Sequence[WhiteRows]) -> tuple[PosteriorMany | None, list[str]]:
-        settings = self.job.posterior
+        settings = self.settings
         column_noise = None if settings.heavy_tails else self.column_noise
         key = jax.random.key(settings.seed + 1)
         try:
@@ -430,7 +424,7 @@ class _Data:
         except ValueError:
             return None
         rows = whiten(second.W, second.y, first.noise, second.valid)
-        heavy = self.job.posterior.heavy_tails
+        heavy = self.settings.heavy_tails
         scores = np.where(rows.valid, log_scores(samples, rows, heavy_tails=heavy), np.nan)
         return scores if rows.valid.sum() > 1 else None
 
@@ -441,24 +435,23 @@ def _laplace(density: Density) -> tuple[jax.Array, jax.Array]:
     return density.laplace()
 
 
-def _data(job: Job, prepared: Prepared) -> _Data:
-    """Rows and prior of a job; robot and human stand side by side in those of both."""
-    model = prepared.model if prepared.pair is None else prepared.pair.robot + prepared.model
-    W, y, valid = (np.asarray(x) for x in (prepared.rows.W, prepared.rows.torque, prepared.rows.valid))
-    difference = noisy_columns(model, prepared.recording, job, prepared.filters)
-    prior = _prior(job, prepared, model, 1 if y.ndim == 1 else y.shape[1])
-    window = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters).window
-    return _Data(job, model, W, y, valid, difference, prepared.noise, window, prior)
+def _data(settings: PosteriorSettings, prepared: Prepared) -> _Data:
+    """Rows and prior; robot and human stand side by side in those of both."""
+    rows, model = prepared.rows, prepared.model if prepared.pair is None else prepared.pair.robot + prepared.model
+    W, y, valid, noisy = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid, rows.noisy))
+    prior = _prior(settings, prepared, model, 1 if y.ndim == 1 else y.shape[1])
+    window = place_windows(prepared.pipeline, rows).window
+    return _Data(settings, model, W, y, valid, noisy, prepared.noise, window, prior)
 
 
-def _prior(job: Job, prepared: Prepared, model: Model, outputs: int) -> Prior:
-    """As the job gives it; and of the robot, what its own recording tells."""
+def _prior(settings: PosteriorSettings, prepared: Prepared, model: Model, outputs: int) -> Prior:
+    """As it is given; and of the robot, what its own recording tells."""
     blocks = []
     if prepared.pair is not None:
         robot, fit = prepared.pair.robot, prepared.pair.robot_fit
         names = model.names[: len(robot.names)]
         blocks = [MultivariateNormal(names, np.asarray(fit.theta), np.asarray(fit.covariance))]
-    return make_prior((*model.names, *noise_names(outputs)), job.posterior.prior, blocks)
+    return make_prior((*model.names, *noise_names(outputs)), settings.prior, blocks)
 
 
 def _gains(model: Model) -> dict[str, Numbers]:
@@ -475,9 +468,9 @@ def _gains(model: Model) -> dict[str, Numbers]:
     return found
 
 
-def _judged(job: Job, prepared: Prepared) -> tuple[Placement, Verdicts]:
+def _judged(prepared: Prepared) -> tuple[Placement, Verdicts]:
     """Windows one behind the other, and what `identify` says of each."""
-    once = replace(job.model, methods=job.model.methods and (1,))  # whose rows are those of the posterior
-    job = replace(job, model=once, window=replace(job.window, step=job.window.length))
-    place = windows_in_rows(job, prepared.recording, prepared.rows, prepared.filters)
-    return place, in_windows(job, prepared)[0].verdicts
+    length = prepared.pipeline.window.length
+    apart = replace(prepared.pipeline.with_window(length, length), methods=(1,))  # whose rows are the posterior's
+    prepared = replace(prepared, pipeline=apart)
+    return place_windows(apart, prepared.rows), in_windows(prepared)[0].verdicts

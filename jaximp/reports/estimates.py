@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identification.identify import Estimates, Reflex
-from jaximp.identification.regression import design_filters
+from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.filters import design_filters
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval

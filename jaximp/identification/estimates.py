@@ -1,0 +1,106 @@
+"""What is found in the windows of one recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.least_squares.window import SlidingFit, WindowFit
+from jaximp.trust.verdicts import Verdicts
+
+
+@dataclass(frozen=True)
+class Reflex:
+    """The reflex of one joint in all windows."""
+
+    name: str
+    """`reflex`; with several joints `joint1.reflex`."""
+    unit: str
+    """Of the gain and of the weights."""
+    lags: NDArray[np.float64]
+    """(k,) [s]."""
+    columns: NDArray[np.int64]
+    """(k,) where their weights stand among the parameters."""
+    gain: NDArray[np.float64]
+    """(M,) sum of the weights; above zero where the reflex resists the stretch."""
+    gain_stderr: NDArray[np.float64]
+    """(M,)."""
+    delay: NDArray[np.float64]
+    """(M,) mean lag by weight [s]; NaN where the gain is within two standard errors of zero."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """One model in all windows of one recording."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    window: float
+    """Length of the windows [s]."""
+    start: NDArray[np.float64]
+    """(M,) time of each window's first sample [s]."""
+    end: NDArray[np.float64]
+    """(M,) time of each window's last sample [s]."""
+    fit: SlidingFit
+    """Parameters, standard errors and condition of every window."""
+    held_out_vaf: NDArray[np.float64]
+    """(M,) how well each window's parameters predict the torque of the window after it."""
+    verdicts: Verdicts
+    threshold: float | None
+    """Threshold on the condition number, eq. (16), where a reference trajectory was given."""
+    time: NDArray[np.float64]
+    """(N,) time of the torque samples below [s]."""
+    torque: NDArray[np.float64]
+    """(N, n) torque that the model had to explain, filtered [N m]; NaN where it did not count."""
+    reconstructed: NDArray[np.float64]
+    """(N, n) the model's torque with the parameters of the window around each sample."""
+    predicted: NDArray[np.float64]
+    """(N, n) the model's torque with parameters that have not seen the sample: those of the last window that ended
+    before the block of one window's length in which the sample lies."""
+    method: int | None = None
+    """Which of the four methods told the human from the robot."""
+    robot: WindowFit | None = None
+    """The robot's parameters, where a method needed them."""
+    robot_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What a reader must know of these numbers, in plain words."""
+    reflexes: tuple[Reflex, ...] = ()
+    """Of every joint that has one."""
+
+    @property
+    def intrinsic(self) -> NDArray[np.int64]:
+        """Which parameters are no weights of a reflex."""
+        weights = [reflex.columns for reflex in self.reflexes]
+        return np.setdiff1d(np.arange(len(self.names)), np.concatenate([[], *weights]))
+
+    def summarised(self) -> Estimates:
+        """With the gain of every reflex in place of its weights: what a person wants to see of all parameters."""
+        if not self.reflexes:
+            return self
+        kept, gone = self.intrinsic, np.full((len(self.end), len(self.reflexes)), np.nan)
+        found = (
+            (self.fit.theta, np.stack([reflex.gain for reflex in self.reflexes], axis=1)),
+            (self.fit.stderr, np.stack([reflex.gain_stderr for reflex in self.reflexes], axis=1)),
+            (self.fit.excitation, gone),
+        )
+        columns = tuple(np.concatenate([np.asarray(x)[:, kept], gain], axis=1) for x, gain in found)
+        return replace(
+            self,
+            names=(*(self.names[k] for k in kept), *(f"{reflex.name}_gain" for reflex in self.reflexes)),
+            units=(*(self.units[k] for k in kept), *(reflex.unit for reflex in self.reflexes)),
+            fit=eqx.tree_at(lambda f: (f.theta, f.stderr, f.excitation), self.fit, columns),
+            reflexes=(),
+        )
+
+    def mean_over_trusted(self) -> NDArray[np.float64]:
+        """(p,) mean of each parameter over the trusted windows; NaN if there are none."""
+        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
+        return theta.mean(axis=0) if len(theta) else np.full(len(self.names), np.nan)
+
+    def sd_over_trusted(self) -> NDArray[np.float64]:
+        """(p,) standard deviation of each parameter over the trusted windows; NaN if there are none."""
+        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
+        return theta.std(axis=0) if len(theta) else np.full(len(self.names), np.nan)

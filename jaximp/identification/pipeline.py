@@ -1,0 +1,149 @@
+"""What is done with a recording, resolved once: model, filters, windows, noise, limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaximp.identification.filters import Filters, FilterSettings, design_filters
+from jaximp.models import Model, PlanarArm
+from jaximp.motion.trajectories import FourierSeries
+from jaximp.signals import filters as signals
+from jaximp.trust.verdicts import TrustLimits
+from jaximp.types import AnyArray, Recording
+
+ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
+"""Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Windows and the samples that count in them."""
+
+    length: float
+    """Length of the sliding window [s]."""
+    step: float | None = None
+    """From one window to the next [s]; by default a fiftieth of the length."""
+    min_velocity: float = 0.0
+    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
+
+    @property
+    def step_seconds(self) -> float:
+        """From one window to the next [s]."""
+        return self.length / 50 if self.step is None else self.step
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """From a recording to verdicts: all that is decided before its first sample is looked at.
+
+    A job and the sample rate of its recording make one; so does anybody who has no job file.
+    """
+
+    sample_rate: float
+    """Of the recordings [Hz]."""
+    model: Model
+    """What is identified in the windows."""
+    window: WindowSettings
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    limits: TrustLimits = field(default_factory=TrustLimits)
+    robot: Model | None = None
+    """The robot that holds the human whom `model` describes; None where there is no such pair."""
+    methods: tuple[int, ...] = (1,)
+    """Which of the four methods tell the human from the robot."""
+    reference: FourierSeries | float | None = None
+    """The motion that was designed, or the period of the recorded reference [s]: for the threshold of fake changes."""
+
+    @property
+    def filters(self) -> Filters:
+        """Designed for the sample rate."""
+        return design_filters(self.filter, self.sample_rate)
+
+    @property
+    def once(self) -> bool:
+        """Whether the filters run over the recording once, and not inside every window."""
+        return self.filter.mode == "once"
+
+    @property
+    def window_samples(self) -> int:
+        """Samples of a window before decimation."""
+        return round(self.window.length * self.sample_rate)
+
+    @property
+    def step_samples(self) -> int:
+        """Samples from one window to the next before decimation."""
+        return round(self.window.step_seconds * self.sample_rate)
+
+    @property
+    def window_rows(self) -> int:
+        """Rows of a window after decimation."""
+        return round(self.window.length * self.sample_rate / self.filters.decimate)
+
+    @property
+    def step_rows(self) -> int:
+        """Rows from one window to the next after decimation."""
+        return max(1, round(self.window.step_seconds * self.sample_rate / self.filters.decimate))
+
+    def with_window(self, length: float, step: float | None = None) -> Pipeline:
+        """With windows of another length, and by default the same step [s]."""
+        step = self.window.step_seconds if step is None else step
+        return replace(self, window=replace(self.window, length=length, step=step))
+
+    def check(self, recording: Recording) -> None:
+        """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees."""
+        signals.require_float64(recording.position)
+        duration = len(recording) / recording.sample_rate
+        if round(self.window.length * recording.sample_rate) > len(recording):
+            raise ValueError(
+                f"the window of {self.window.length:g} s is longer than the recording of {duration:.4g} s: "
+                "shorten window.length"
+            )
+        self._check_memory(recording)
+        if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
+            _check_elbow(recording)
+
+    def _check_memory(self, recording: Recording) -> None:
+        """A model with memory must see the past, and know how many samples it is."""
+        if self.model.sample_rate is None:
+            return
+        if not self.once:
+            raise ValueError(
+                "filter.mode = 'window' cuts off the past that a reflex answers to: set filter.mode = 'once', or leave "
+                "the reflex out"
+            )
+        if abs(self.model.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+            raise ValueError(
+                f"the reflex was made for {self.model.sample_rate:g} Hz, but the recording has "
+                f"{recording.sample_rate:g} Hz: give the model the recording's sample rate"
+            )
+
+    def reference_motion(self, recording: Recording) -> ReferenceMotion:
+        """One period of the motion that the joint was to make, or why none is known."""
+        rate = self.sample_rate
+        if isinstance(self.reference, FourierSeries):
+            series = self.reference
+            q, dq, ddq = (x.reshape(len(x), -1) for x in series(jnp.arange(round(float(series.period) * rate)) / rate))
+            if q.shape[1] != recording.n_joints:
+                raise ValueError(f"the design moves {q.shape[1]} joints, but the recording has {recording.n_joints}")
+            return q, dq, ddq
+        if recording.reference is None or self.reference is None:
+            missing = "reference position" if recording.reference is None else "reference_period"
+            return (
+                f"no {missing} was given, so the threshold for fake changes (Tout et al. 2023, eq. 16; for periodic "
+                "reference motions) is not applied"
+            )
+        reference = recording.reference[: round(self.reference * rate)]
+        if len(reference) < round(self.reference * rate) or not np.isfinite(reference).all():
+            return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
+        return reference, *signals.central_differences(reference, rate)
+
+
+def _check_elbow(recording: Recording) -> None:
+    """A human's elbow does not turn further than half a turn; degrees that pass for radians do."""
+    farthest = float(np.nanmax(np.abs(recording.position[:, 1])))
+    if farthest > np.pi:
+        raise ValueError(
+            f"the elbow turns to {farthest:.3g} rad, more than half a turn: are these degrees? Give unit = 'deg'"
+        )

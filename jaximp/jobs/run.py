@@ -1,0 +1,78 @@
+"""Jobs, run: a job and its files -> results in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximp.identification.check import Finding, Proposal, check_recording
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.identify import Prepared, estimate
+from jaximp.identification.identify import prepare as prepare_recording
+from jaximp.jobs.job import Job
+from jaximp.perturbation.impedance import ArmImpedance, identify_trials
+from jaximp.posterior.densities import estimate_density
+from jaximp.posterior.draws import Posterior, derive
+from jaximp.posterior.inference import Inference, posterior_of
+from jaximp.posterior.samplers import sample_posterior
+from jaximp.types import Progress, Recording
+
+
+def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates]:
+    """Run a job: one `Estimates` per method (a job without a robot beside the human has one).
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    return identify_recording(job, job.load(), job.load_robot_alone(), progress)
+
+
+def identify_recording(
+    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+) -> list[Estimates]:
+    """As `identify`, for recordings that are in memory."""
+    return estimate(job.pipeline_for(recording), recording, alone, progress)
+
+
+def prepare(job: Job, recording: Recording | None = None, alone: Recording | None = None) -> Prepared:
+    """Read the recordings of a job (or take these) and filter them: rows for least squares, windows still to come."""
+    if recording is None:
+        recording, alone = job.load(), job.load_robot_alone()
+    return prepare_recording(job.pipeline_for(recording), recording, alone)
+
+
+def check(
+    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+) -> tuple[list[Finding], Proposal]:
+    """Look at a recording for the model of a job, and propose cut-offs and a window."""
+    return check_recording(job.pipeline_for(recording), recording, alone, progress)
+
+
+def infer(job: Job, progress: Progress = lambda share: None) -> Inference:
+    """Posteriors of a job with a recording.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy: filters inside every window, parameters
+    that the data leave undetermined, an impossible prior, and as `identify`.
+    """
+    return infer_recording(job, job.load(), job.load_robot_alone(), progress)
+
+
+def infer_recording(
+    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+) -> Inference:
+    """As `infer`, for recordings that are in memory."""
+    return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)
+
+
+def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[ArmImpedance, Posterior]:
+    """An arm's damping and stiffness from a job with `[trials]`: the estimate, and draws of D11 to K22 around it.
+
+    Student's t with the estimate's covariance and degrees of freedom, within positive definite stiffnesses.
+
+    **Raises:** `ValueError` for an estimate without standard errors, and as `identify_trials`.
+    """
+    found = identify_trials(job, lambda share: progress(0.8 * share)).main
+    if not np.isfinite(found.covariance).all():
+        raise ValueError(f"the impedance has no standard errors, and so no posterior: {found.reason}")
+    density = estimate_density(found.names, found.units, found.theta, found.covariance, found.dof)
+    drawn = sample_posterior(density, ess=job.posterior.ess, seed=job.posterior.seed)
+    progress(1.0)
+    return found, derive(drawn, density.elements, density.element_names, density.element_units)
