@@ -17,7 +17,7 @@ import numpy as np
 
 from jaximp import identify, parse_job
 from jaximp.identification.regression import design_filters, noise_of_rows, regress
-from jaximp.least_squares.window import least_squares
+from jaximp.least_squares import least_squares
 
 jax.config.update("jax_enable_x64", True)
 

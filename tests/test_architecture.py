@@ -75,9 +75,18 @@ def test_imports_point_one_way(module: str) -> None:
     package = module.split(".")[0]
     assert package in HEIGHT, f"'{package}' is new: give it a place in this test"
     for other in own(module):
-        assert other, f"{module} imports from jaximp itself: import from the module that holds the name"
+        assert other, f"{module} imports from jaximp itself: import from the file that holds the name"
         if (module, other) not in STILL_UP:
             assert HEIGHT[other] <= HEIGHT[package], f"{module} imports from {other}, which stands above it"
+
+
+@every_module
+def test_names_are_imported_from_the_file_that_holds_them(module: str) -> None:
+    """Never through the public face of a package, which is for users: so no import can go round in a circle."""
+    for name in imports(module):
+        source, _, last = name.removeprefix("jaximp.").rpartition(".")
+        if name.startswith("jaximp.") and name.removeprefix("jaximp.") not in MODULES:
+            assert MODULES[source].name != "__init__.py", f"{module} takes {last} from the package {source}"
 
 
 @every_module

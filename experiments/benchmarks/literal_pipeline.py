@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from jaximp.identification import fit_robot
 from jaximp.identification.identify import identify_recording, regress_both
 from jaximp.identification.regression import design_filters, noise_of_rows
-from jaximp.identification.separation import fit_robot
-from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
-from jaximp.least_squares.sliding import sliding_theta
-from jaximp.simulation.rig import HumanLoad
+from jaximp.jobs import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
+from jaximp.least_squares import sliding_theta
+from jaximp.simulation import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
 from jaximp.types import Recording
 

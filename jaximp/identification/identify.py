@@ -33,7 +33,8 @@ from jaximp.identification.separation import METHODS, Regression, Separation, fi
 from jaximp.jobs.job import Job
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
-from jaximp.models import Joints, Model, combine, pathway_of, with_gain
+from jaximp.models.base import Joints, Model, combine
+from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.signals import filters as signals
 from jaximp.trust.verdicts import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from jaximp.jobs.job import FilterSettings, Job
 from jaximp.least_squares.chunks import cores
 from jaximp.least_squares.sliding import slice_window, window_starts
-from jaximp.models import MOTION, Model
+from jaximp.models.base import MOTION, Model
 from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 

@@ -45,7 +45,7 @@ from jaximp.least_squares.chunks import LONGEST_REACH, Task, finish
 from jaximp.least_squares.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, solve_chunk
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares, window_starts
 from jaximp.least_squares.window import variance_accounted_for
-from jaximp.models import Joints, Model
+from jaximp.models.base import Joints, Model
 from jaximp.numerics.compilation import compiled
 from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording

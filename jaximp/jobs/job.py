@@ -17,7 +17,10 @@ from jaximp.design.files import read_trajectory
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import HandArmSettings, TrialsSettings, arm_settings, trials_settings
-from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
+from jaximp.models.arm import PlanarArm
+from jaximp.models.base import Joints, Model
+from jaximp.models.joint import HumanJoint, RobotJoint
+from jaximp.models.reflex import ReflexPathway
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping

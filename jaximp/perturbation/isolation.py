@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Integer, Num
 from scipy.fft import next_fast_len
 
 from jaximp.design.objectives import solve_gram
-from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
+from jaximp.models.arm import PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import array_field
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Handle, Movements, cut_at_onset
 from jaximp.perturbation.output_error import output_error

@@ -35,7 +35,8 @@ from jaximp.least_squares.noise import (
     whitened_covariance,
     whiteness,
 )
-from jaximp.models import Joints, Model, pathway_of
+from jaximp.models.base import Joints, Model
+from jaximp.models.reflex import pathway_of
 from jaximp.perturbation.impedance import ArmImpedance, identify_trials
 from jaximp.posterior.densities import (
     Density,

@@ -1,0 +1,9 @@
+from .check import Finding as Finding
+from .check import Proposal as Proposal
+from .check import check_recording as check_recording
+from .identify import Estimates as Estimates
+from .identify import identify_recording as identify_recording
+from .separation import Regression as Regression
+from .separation import Separation as Separation
+from .separation import fit_robot as fit_robot
+from .separation import separate as separate

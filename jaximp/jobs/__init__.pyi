@@ -1,0 +1,16 @@
+from .design import DesignJob as DesignJob
+from .design import parse_design_job as parse_design_job
+from .design import read_design_job as read_design_job
+from .job import ArmSettings as ArmSettings
+from .job import FilterSettings as FilterSettings
+from .job import HumanSettings as HumanSettings
+from .job import Job as Job
+from .job import ModelSettings as ModelSettings
+from .job import PosteriorSettings as PosteriorSettings
+from .job import ReflexSettings as ReflexSettings
+from .job import RobotSettings as RobotSettings
+from .job import WindowSettings as WindowSettings
+from .job import parse_job as parse_job
+from .job import read_job as read_job
+from .trials import HandArmSettings as HandArmSettings
+from .trials import TrialsSettings as TrialsSettings
