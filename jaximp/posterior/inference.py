@@ -15,7 +15,6 @@ from itertools import pairwise
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.stats import chi2, norm
 
 from jaximp.identification.identify import Prepared, in_windows, prepare
 from jaximp.identification.regression import Placement, noisy_columns, windows_in_rows
@@ -187,6 +186,8 @@ class Inference:
         return float(within[counted].mean())
 
     def _contradiction(self) -> str:
+        from scipy.stats import chi2
+
         if self.good.sum() < 2:
             return ""
         windows = self.summarised[1]
@@ -206,6 +207,8 @@ class Inference:
         )
 
     def _shifted(self) -> str:
+        from scipy.stats import norm
+
         k = int(np.abs(self.shift).argmax())
         p = 2 * norm.sf(np.abs(self.shift[k])) * len(self.shift)
         if p >= CONTRADICTION:
