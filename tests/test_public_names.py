@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -61,3 +63,26 @@ def test_names_that_moved_say_where_they_are() -> None:
 def test_what_never_was_is_missing() -> None:
     with pytest.raises(AttributeError, match="no_such_name"):
         jaximp.no_such_name  # noqa: B018
+
+
+HEAVY = (
+    "arviz", "blackjax", "bokeh", "cvxpy", "dask", "distributed", "emcee", "h5py", "jaxopt", "matplotlib", "pandas",
+    "pint", "pyarrow", "scipy.fft", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal",
+    "scipy.special", "scipy.stats", "xarray",
+)  # fmt: skip
+TOUCHED = "import jaximp; [getattr(jaximp, name) for name in jaximp.__all__]"
+
+
+@pytest.mark.parametrize(
+    ("program", "absent"),
+    [
+        ("import jaximp", ("jax", "numpy", *HEAVY)),
+        (TOUCHED, ("rich", "typer", *HEAVY)),
+        ("import jaximp.cli.main", ("jax", "numpy", *HEAVY)),
+    ],
+    ids=["import", "every name", "command line"],
+)
+def test_what_is_slow_to_import_waits_until_it_is_needed(program: str, absent: tuple[str, ...]) -> None:
+    program += f"; import sys; print(*sorted({{*{absent!r}}} & {{*sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"
