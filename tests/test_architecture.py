@@ -86,7 +86,7 @@ def test_names_are_imported_from_the_file_that_holds_them(module: str) -> None:
     for name in imports(module):
         source, _, last = name.removeprefix("jaximp.").rpartition(".")
         if name.startswith("jaximp.") and name.removeprefix("jaximp.") not in {*MODULES, "__version__"}:
-            assert MODULES[source].name != "__init__.py", f"{module} takes {last} from the package {source}"
+            assert MODULES[source].name != "__init__.py", f"import {last} from its file, not from jaximp.{source}"
 
 
 @every_module

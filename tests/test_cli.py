@@ -50,8 +50,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  #
         monkeypatch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
         with pytest.raises(SystemExit) as stopped:
             cli.main()
-        captured = capsys.readouterr()
-        return int(stopped.value.code or 0), captured.out, captured.err
+        said, complained = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in capsys.readouterr())  # without colours
+        return int(stopped.value.code or 0), said, complained
 
     return call
 
