@@ -18,9 +18,10 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp import SlidingFit, adaptive_least_squares, parse_job, plots, sliding_least_squares
-from jaximp.jobs.run import prepare
-from jaximp.simulation.rig import HumanLoad
+from jaximp import adaptive_least_squares, parse_job, plots, sliding_least_squares
+from jaximp.jobs import prepare
+from jaximp.least_squares import SlidingFit
+from jaximp.simulation import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
 
 jax.config.update("jax_enable_x64", True)

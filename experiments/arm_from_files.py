@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 import jax
 import numpy as np
 
-from jaximp import ArmImpedance, KnownArm, identify_impedance, identify_trials, parse_job, read_job
-from jaximp.perturbation.isolation import METHODS
-from jaximp.simulation.arm_recordings import write_arm_recordings
+from jaximp import ArmImpedance, identify_impedance, identify_trials, parse_job, read_job
+from jaximp.perturbation.isolation import METHODS, KnownArm
+from jaximp.simulation import write_arm_recordings
 
 jax.config.update("jax_enable_x64", True)
 

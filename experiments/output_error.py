@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, savgol_filter, sosfilt
 
 from jaximp.models import ArmGeometry
-from jaximp.perturbation.isolation import static_inertia
-from jaximp.perturbation.movements import Movements
+from jaximp.perturbation import Movements, static_inertia
 from jaximp.perturbation.output_error import OutputErrorFit, output_error
 from jaximp.simulation.neuromuscular import (
     ANGLES,

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from jaximp import identify, parse_job
-from jaximp.identification.identify import prepare
-from jaximp.least_squares.window import least_squares
+from jaximp.jobs import prepare
+from jaximp.least_squares import least_squares
 
 jax.config.update("jax_enable_x64", True)
 
@@ -89,7 +89,7 @@ def emps() -> dict[str, Any]:
     """Whole recording and windows of 5 s against the published parameters."""
     job = parse_job(EMPS, DATA)
     recording = job.load()
-    prepared = prepare(job.pipeline_for(recording), recording)
+    prepared = prepare(job, recording)
     model, rows = prepared.model, prepared.rows
     whole = least_squares(rows.W, rows.torque, rows.valid, prepared.noise)
     estimates = identify(job)[0]
@@ -138,7 +138,7 @@ def pendulum() -> dict[str, Any]:
     for name in files:
         job = parse_job(PENDULUM.replace("FILE", name), DATA)
         recording = job.load()
-        prepared = prepare(job.pipeline_for(recording), recording)
+        prepared = prepare(job, recording)
         model, rows = prepared.model, prepared.rows
         parts.append((np.asarray(rows.W), np.asarray(rows.torque), rows.valid))
     noise = prepared.noise

@@ -20,12 +20,11 @@ from real_recordings import ANKLE, DATA, REFLEX
 from scipy.signal import butter, cont2discrete, lfilter, sosfiltfilt
 
 from jaximp import parse_job, plots
-from jaximp.identification.identify import Prepared, prepare
-from jaximp.jobs.job import Job
-from jaximp.jobs.run import identify_recording
-from jaximp.least_squares.window import confidence_interval, least_squares
+from jaximp.identification.identify import Prepared
+from jaximp.jobs import Job, identify_recording, prepare
+from jaximp.least_squares import confidence_interval, least_squares
 from jaximp.models import pathway_of, reflex_gain
-from jaximp.recordings.load import recording_from_arrays
+from jaximp.recordings import recording_from_arrays
 from jaximp.types import Recording
 
 jax.config.update("jax_enable_x64", True)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from jaximp.motion.trajectories import FourierSeries
+from jaximp.motion import FourierSeries
 
 jax.config.update("jax_enable_x64", True)
 

@@ -20,8 +20,8 @@ import numpy as np
 from jaximp import Limits, design_excitation, parse_job, sliding_least_squares
 from jaximp.jobs.run import prepare
 from jaximp.models import HumanJoint, RobotJoint
-from jaximp.motion.trajectories import FourierSeries
-from jaximp.simulation.rig import HUMAN_TRAJECTORY, HumanLoad, Rig
+from jaximp.motion import FourierSeries
+from jaximp.simulation import HUMAN_TRAJECTORY, HumanLoad, Rig
 from jaximp.simulation.rig_recordings import rig_recordings
 
 jax.config.update("jax_enable_x64", True)

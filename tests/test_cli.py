@@ -1,6 +1,7 @@
 """The command line as a person meets it: exit status, one line for bad input, nothing half-written."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import pytest
 from scipy.io import savemat
 from test_identify import TIME, joint
 
+import jaximp
 from jaximp import papers
 from jaximp.cli import main as cli
+from jaximp.cli.reproduce import Paper
 from jaximp.recordings.load import save_recording
 
 JOB = """
@@ -47,8 +50,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  #
         monkeypatch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
         with pytest.raises(SystemExit) as stopped:
             cli.main()
-        captured = capsys.readouterr()
-        return int(stopped.value.code or 0), captured.out, captured.err
+        said, complained = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in capsys.readouterr())  # without colours
+        return int(stopped.value.code or 0), said, complained
 
     return call
 
@@ -77,7 +80,7 @@ def test_check_proposes(run, job: Path) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_simulate_writes_what_identify_reads(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    assert run("simulate", "rig", "--holding", "bands", "--out", tmp_path / "rig")[0] == 0
+    assert run("simulate", "rig", "--holding", "bands", "-o", tmp_path / "rig")[0] == 0
     names = {path.name for path in (tmp_path / "rig").iterdir()}
     assert {"job.toml", "robot_alone.csv", "robot_with_human.csv"} <= names
 
@@ -118,15 +121,31 @@ def test_every_paper_can_be_reproduced() -> None:
     """That of every study which has a function for it."""
     folder = Path(papers.__file__).parent
     there = {file.stem for file in folder.glob("*.py") if "\ndef reproduce(" in file.read_text(encoding="utf-8")}
-    assert there == {paper.value for paper in cli.Paper} == {"tout2023", "lakatos2011", "borner2020"}
+    assert there == {paper.value for paper in Paper} == {"tout2023", "lakatos2011", "borner2020"}
 
 
-@pytest.mark.parametrize("command", ["demo", "check", "identify", "simulate", "reproduce"])
+COMMANDS = ["demo", "check", "identify", "posterior", "design", "simulate", "batch", "reproduce"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_teaches(run, command: str) -> None:  # type: ignore[no-untyped-def]
     status, said, _ = run(command, "--help")
     assert status == 0
     assert "Usage" in said
     assert len(said) > 300
+    assert run(command, "-h")[:2] == (0, said)
+    if command != "check":
+        assert re.search(r"--out +-o ", said)
+
+
+def test_commands_are_listed(run) -> None:  # type: ignore[no-untyped-def]
+    status, said, _ = run("-h")
+    assert status == 0
+    assert re.findall(r"^│ ([a-z]+) ", said, re.MULTILINE) == COMMANDS
+
+
+def test_the_version_is_said(run) -> None:  # type: ignore[no-untyped-def]
+    assert run("--version") == (0, f"jaximp {jaximp.__version__}\n", "")
 
 
 LINES = "\n".join(f"{t:.3f},{np.sin(9 * t):.6f},{np.sin(9 * t + 1):.6f}" for t in TIME[:3000])

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from jaximp.design import excitation
+from jaximp.identification import FilterSettings
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filters import Filters
 from jaximp.identification.identify import in_windows, prepare
 from jaximp.identification.regression import measure, regress, undisturbed
-from jaximp.jobs.job import FilterSettings, Job, parse_job
+from jaximp.jobs import Job, parse_job
 from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import least_squares
 from jaximp.models import (

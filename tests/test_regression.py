@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
+from jaximp.identification import FilterSettings, WindowSettings
 from jaximp.identification.filters import Filters
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
-from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
+from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.signals.filters import central_differences

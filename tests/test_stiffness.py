@@ -116,7 +116,7 @@ def test_exact_data_are_recovered(damping: str) -> None:
 def test_linear_fit_is_that_of_numpy_and_has_no_symmetry() -> None:
     lopsided = np.array([[29.0, 16.0], [12.0, 17.0]])
     displacement, velocity, torque = (x[0] for x in trials(1, 6, lopsided))
-    fit = jaximp.fit_stiffness_linear(displacement, velocity, torque)
+    fit = jaximp.perturbation.fit_stiffness_linear(displacement, velocity, torque)
     W = np.concatenate([velocity, displacement], axis=-1).reshape(-1, 4)
     expected = np.linalg.lstsq(W, torque.reshape(-1, 2))[0].T
     np.testing.assert_allclose(np.hstack([fit.D, fit.K]), expected, rtol=1e-9)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaximp import load_recording, recording_from_arrays, save_recording
-from jaximp.jobs.job import FilterSettings
+from jaximp.identification import FilterSettings
 from jaximp.least_squares.window import WindowFit
 from jaximp.models import ArmGeometry, PlanarArm
 from jaximp.perturbation.trials import (

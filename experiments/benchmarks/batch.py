@@ -34,12 +34,12 @@ jax.monitoring.register_event_duration_secs_listener(
     lambda event, seconds, **about: compiled.append(event) if event.endswith("backend_compile_duration") else None
 )
 
+from jaximp.batch import find_items, make_plan  # noqa: E402
 from jaximp.batch import results as batch_results  # noqa: E402
 from jaximp.batch import run as batch  # noqa: E402
-from jaximp.batch.plan import find_items, make_plan  # noqa: E402
 from jaximp.identification import regression  # noqa: E402
-from jaximp.jobs.job import Job, read_job  # noqa: E402
-from jaximp.recordings.load import recording_from_arrays, save_recording  # noqa: E402
+from jaximp.jobs import Job, read_job  # noqa: E402
+from jaximp.recordings import recording_from_arrays, save_recording  # noqa: E402
 
 HERE = Path(__file__).parent
 DISTINCT = 100

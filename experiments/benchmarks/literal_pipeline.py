@@ -22,12 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from jaximp.identification import FilterSettings, WindowSettings, fit_robot
 from jaximp.identification.identify import noise_of, regress_pair
-from jaximp.identification.separation import fit_robot
-from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
-from jaximp.jobs.run import identify_recording
-from jaximp.least_squares.sliding import sliding_theta
-from jaximp.simulation.rig import HumanLoad
+from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings, identify_recording
+from jaximp.least_squares import sliding_theta
+from jaximp.simulation import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
 from jaximp.types import Recording
 

@@ -45,14 +45,14 @@ def ours(what: str, n: int, p: int, window: int, repeats: int = 5) -> dict[str, 
 
     jax.config.update("jax_enable_x64", True)
     import jaximp
-    from jaximp.signals.filters import autocovariance, butterworth
+    from jaximp.signals import autocovariance, butterworth
 
     W, y = data(n, p)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # A 40 Hz low-pass of order 4 at 1 kHz, and every fifth sample kept.
     noise = autocovariance(butterworth(4, 40, 1000), 5) if what == "coloured" else None
     fits = {
-        "theta": lambda: jaximp.sliding_theta(W, y, window),
+        "theta": lambda: jaximp.least_squares.sliding_theta(W, y, window),
         "textbook": lambda: jaximp.sliding_least_squares(W, y, window),
         "coloured": lambda: jaximp.sliding_least_squares(W, y, window, noise=noise),
         "recursive": lambda: jax.block_until_ready(jaximp.recursive_least_squares(W, y, 0.999)),

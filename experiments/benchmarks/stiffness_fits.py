@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 jax.config.update("jax_enable_x64", True)
 
-from jaximp import fit_triangles, residual_triangle  # noqa: E402
+from jaximp.perturbation import fit_triangles, residual_triangle  # noqa: E402
 
 RESULTS = Path(__file__).parents[1] / "results"
 FITS, TRIALS, SAMPLES, REPEATS = 10_000, 20, 460, 7

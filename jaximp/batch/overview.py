@@ -22,7 +22,6 @@ from urllib.parse import quote
 import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
-from scipy.special import stdtrit
 
 from jaximp import plots
 from jaximp.reports.pages import template, versions, without_nan
@@ -175,6 +174,8 @@ def _group_mean(
     group: tuple[Any, ...], means: Sequence[tuple[Any, float]], left_out: int, by_subject: bool
 ) -> GroupMean:
     """The mean over the units (subjects or recordings) among (unit, mean) pairs."""
+    from scipy.special import stdtrit
+
     of_unit: dict[Any, list[float]] = {}
     for unit, mean in means:
         of_unit.setdefault(unit, []).append(mean)

@@ -33,7 +33,8 @@ from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.windows import LAGS_GRAIN
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import SlidingFit, confidence_interval
-from jaximp.models import Joints, Model, pathway_of
+from jaximp.models.base import Joints, Model
+from jaximp.models.reflex import pathway_of
 from jaximp.recordings.load import recording_from_mapping
 from jaximp.recordings.readers import MATRICES, RecordingError, UnavailableError, count_samples
 from jaximp.reports.estimates import estimates_table

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.models import HumanJoint, Joints, Model
+from jaximp.models.base import Joints, Model
+from jaximp.models.joint import HumanJoint
 
 UNKNOWN = "no bound is known for a model that is not linear in position, velocity and acceleration"
 

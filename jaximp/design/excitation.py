@@ -30,7 +30,7 @@ from jaximp.design.bounds import condition_bound
 from jaximp.design.objectives import log_condition, log_sigma_min, log_stderr, log_volume
 from jaximp.design.optimise import METHODS, minimise, onto_polytope
 from jaximp.least_squares.chunks import cores
-from jaximp.models import Model
+from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries, at_rest, jerk
 from jaximp.signals.filters import butterworth, central_differences, require_float64
 from jaximp.types import AnyArray, Numbers, Progress, nearest

@@ -30,7 +30,8 @@ from jaximp.identification.windows import (
 )
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
-from jaximp.models import Joints, Model, combine, pathway_of, with_gain
+from jaximp.models.base import Joints, Model, combine
+from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.verdicts import fake_change_threshold, judge, worst
 from jaximp.types import Progress, Recording, nearest
 

@@ -21,7 +21,7 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows, measured_motion, undisturbed
 from jaximp.least_squares.chunks import cores
 from jaximp.least_squares.sliding import slice_window, window_starts
-from jaximp.models import MOTION, Model
+from jaximp.models.base import MOTION, Model
 from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp.identification.filters import Filters, FilterSettings, design_filters
-from jaximp.models import Model, PlanarArm
+from jaximp.models.arm import PlanarArm
+from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.signals import filters as signals
 from jaximp.trust.verdicts import TrustLimits

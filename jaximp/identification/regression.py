@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from jaximp.identification.filters import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
-from jaximp.models import Model
+from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled
 from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording

@@ -12,7 +12,8 @@ from jaximp.design.excitation import OBJECTIVES, Design, Encoder, Limits, design
 from jaximp.design.optimise import METHODS
 from jaximp.jobs.job import ModelSettings, model_settings
 from jaximp.jobs.settings import check_keys, checked, read, settings
-from jaximp.models import Joints, Model, RobotJoint, combine
+from jaximp.models.base import Joints, Model, combine
+from jaximp.models.joint import RobotJoint
 from jaximp.types import Progress, nearest
 
 

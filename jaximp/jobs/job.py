@@ -19,7 +19,10 @@ from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import HandArmSettings, TrialsSettings, arm_settings, trials_settings
-from jaximp.models import HumanJoint, Joints, Model, PlanarArm, ReflexPathway, RobotJoint
+from jaximp.models.arm import PlanarArm
+from jaximp.models.base import Joints, Model
+from jaximp.models.joint import HumanJoint, RobotJoint
+from jaximp.models.reflex import ReflexPathway
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.jobs.settings import check_keys, settings
-from jaximp.models import ArmGeometry
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.movement_trials import read_movements, read_postures
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Handle, Movements
 from jaximp.recordings.load import check_mapping, load_recording, load_trial_table

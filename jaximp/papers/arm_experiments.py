@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 from numpy.typing import NDArray
 
-from jaximp.models import ArmLinks, borner_from_lakatos, rigid_body_torque
+from jaximp.models.arm import ArmLinks, borner_from_lakatos, rigid_body_torque
 from jaximp.perturbation.isolation import in_window
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Movements
 from jaximp.simulation.neuromuscular import (

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp import plots
-from jaximp.models import EndpointImpedance, endpoint_impedance, lakatos_from_borner
+from jaximp.models.arm import lakatos_from_borner
+from jaximp.models.endpoint import EndpointImpedance, endpoint_impedance
 from jaximp.motion.trajectories import RaisedSine, jerk
 from jaximp.papers.arm_experiments import (
     QUANTITIES,

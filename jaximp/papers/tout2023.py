@@ -24,7 +24,7 @@ from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import fit_robot
 from jaximp.least_squares.recursive import recursive_least_squares
 from jaximp.least_squares.window import variance_accounted_for
-from jaximp.models import HumanJoint, RobotJoint
+from jaximp.models.joint import HumanJoint, RobotJoint
 from jaximp.simulation.rig import ROBOT_TRAJECTORY, ElasticBands, HumanLoad, Rig
 from jaximp.simulation.rig_recordings import rig_recordings
 from jaximp.types import Progress, Recording

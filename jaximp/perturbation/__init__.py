@@ -1,1 +1,5 @@
 """An arm that is perturbed: trials, isolation of the involuntary answer, damping and stiffness."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
-from scipy.fft import next_fast_len
 
 from jaximp.design.objectives import solve_gram
-from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
+from jaximp.models.arm import PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import array_field
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Handle, Movements, cut_at_onset
 from jaximp.perturbation.output_error import output_error
@@ -110,6 +110,8 @@ def energy_spectra(perturbed: Movements, unperturbed: Movements) -> tuple[Number
 
     **Returns:** frequencies (F,) up to 50 Hz, and densities (F, 2) of unperturbed and perturbed trials [m^2/s^4].
     """
+    from scipy.fft import next_fast_len
+
     rate = perturbed.sample_rate
     # Means of short blocks say all that there is to say of frequencies so low.
     block = max(1, int(rate / (8 * HIGHEST_CUTOFF)))

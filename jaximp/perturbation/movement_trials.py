@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from jaximp.models import ArmGeometry
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Handle, Movements
 from jaximp.signals.filters import (
     butterworth,

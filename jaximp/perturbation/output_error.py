@@ -61,10 +61,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
-from scipy.interpolate import CubicSpline
-from scipy.stats import t as student
 
-from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
+from jaximp.models.arm import coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Deviations, Handle, Movements
 from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers
@@ -151,6 +150,8 @@ class OutputErrorFit(eqx.Module):
     def margin(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
         """Half widths (*G, 2, 2) of the intervals that hold the elements of D and those of K with probability `level`:
         the mean impedance of the group's trials."""
+        from scipy.stats import t as student
+
         half = student.ppf(0.5 + level / 2, self.dof) * self.stderr
         shape = (*half.shape[:-1], 2, 2)
         return half[..., :4].reshape(shape), half[..., 4:7][..., PAIRS].reshape(shape)
@@ -373,6 +374,8 @@ def _in_lanes(perturbed: Movements, geometry: ArmGeometry, handle: Handle, bins:
 
     def cut(x: Any, first: int, last: int) -> Numbers:
         """(S, 2, T), with new samples between the old by a cubic spline."""
+        from scipy.interpolate import CubicSpline
+
         x = np.asarray(x)
         samples = np.clip(onset[:, None] + np.arange(first, last + 1), 0, x.shape[1] - 1)
         x = np.moveaxis(x[np.arange(len(x))[:, None], samples], 0, -1)

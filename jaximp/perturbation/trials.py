@@ -20,7 +20,8 @@ from jaximp.design.objectives import solve_gram
 from jaximp.identification.filters import FilterSettings, design_filters
 from jaximp.identification.regression import filtered
 from jaximp.least_squares.window import WindowFit, least_squares, variance_accounted_for
-from jaximp.models import ArmGeometry, PlanarArm, solve_pair
+from jaximp.models.arm import PlanarArm
+from jaximp.models.kinematics import ArmGeometry, solve_pair
 from jaximp.perturbation.movement_trials import NOISE, check_directions, check_hand, find_onset, trial_name
 from jaximp.recordings.load import load_recording
 from jaximp.signals.filters import kept_variance

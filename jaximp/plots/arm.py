@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaximp.models import ArmGeometry, EndpointImpedance, ellipse
+from jaximp.models.endpoint import EndpointImpedance, ellipse
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.plots.style import BLACK, BLUE, GREEN, ORANGE, PALE, VERMILLION, WIDTH, styled
 from jaximp.types import Numbers
 

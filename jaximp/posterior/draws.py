@@ -17,9 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import digamma, ndtri, polygamma
-from scipy.stats import rankdata, t
 
 from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers, nearest
@@ -257,6 +254,9 @@ def _halves(x: NDArray[Any]) -> Numbers:
 
 def _normal_scores(x: Numbers) -> Numbers:
     """Ranks among all chains, as quantiles of the normal distribution (Blom 1958)."""
+    from scipy.special import ndtri
+    from scipy.stats import rankdata
+
     flat = x.reshape(len(x), -1)
     scores = ndtri((np.arange(2, 2 * flat.shape[1] + 1) / 2 - 3 / 8) / (flat.shape[1] + 1 / 4))
     return scores[(2 * rankdata(flat, axis=1)).astype(int) - 2].reshape(x.shape)
@@ -270,6 +270,8 @@ def _rhat(x: Numbers) -> Numbers:
 
 def _effective(x: Numbers) -> Numbers:
     """Effective samples of the mean of (K, C, N), from the autocorrelation over all chains."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
     C, N = x.shape[1:]
     spectrum = rfft(x - x.mean(axis=-1, keepdims=True), n=next_fast_len(2 * N, real=True), axis=-1)
     power = (spectrum.real**2 + spectrum.imag**2).mean(axis=1)
@@ -341,6 +343,8 @@ class ExactPosterior(eqx.Module):
     @property
     def mean(self) -> Numbers:
         """(p,) also where too few degrees of freedom leave the parameters none: then it is their mode."""
+        from scipy.special import digamma
+
         half = float(self.dof) / 2
         log_noise = np.log(float(self.scale)) + (np.log(half) - digamma(half)) / 2
         return np.append(np.asarray(self.location), log_noise)
@@ -348,6 +352,8 @@ class ExactPosterior(eqx.Module):
     @property
     def covariance(self) -> Numbers:
         """(p, p), infinite with two degrees of freedom or fewer."""
+        from scipy.special import polygamma
+
         k, dof = len(self.location), float(self.dof)
         inverse = np.linalg.inv(np.asarray(self.R))
         result = np.zeros((k + 1, k + 1))
@@ -358,7 +364,7 @@ class ExactPosterior(eqx.Module):
 
     def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
         """Lower and upper ends (p,) that hold each parameter with probability `level`, as much on either side."""
-        from scipy.stats import chi2
+        from scipy.stats import chi2, t
 
         dof = float(self.dof)
         stderr = float(self.scale) * np.linalg.norm(np.linalg.inv(np.asarray(self.R)), axis=1)

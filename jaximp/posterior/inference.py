@@ -15,7 +15,6 @@ from itertools import pairwise
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.stats import chi2, norm
 
 from jaximp.identification.identify import Prepared, in_windows, prepare
 from jaximp.identification.pipeline import Pipeline
@@ -35,7 +34,8 @@ from jaximp.least_squares.noise import (
     whitened_covariance,
     whiteness,
 )
-from jaximp.models import Joints, Model, pathway_of
+from jaximp.models.base import Joints, Model
+from jaximp.models.reflex import pathway_of
 from jaximp.posterior.densities import (
     Density,
     linear_density,
@@ -197,6 +197,8 @@ class Inference:
         return float(within[counted].mean())
 
     def _contradiction(self) -> str:
+        from scipy.stats import chi2
+
         if self.good.sum() < 2:
             return ""
         windows = self.summarised[1]
@@ -216,6 +218,8 @@ class Inference:
         )
 
     def _shifted(self) -> str:
+        from scipy.stats import norm
+
         k = int(np.abs(self.shift).argmax())
         p = 2 * norm.sf(np.abs(self.shift[k])) * len(self.shift)
         if p >= CONTRADICTION:

@@ -23,7 +23,8 @@ from jaximp.identification.filters import design_filters
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
-from jaximp.models import HumanJoint, Joints, Model
+from jaximp.models.base import Joints, Model
+from jaximp.models.joint import HumanJoint
 from jaximp.reports.pages import (
     inline,
     percent,

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from jaximp import plots
 from jaximp.jobs.job import Job
-from jaximp.models import (
+from jaximp.models.endpoint import (
     Ellipse,
     EndpointImpedance,
     ellipse,

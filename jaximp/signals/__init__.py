@@ -1,1 +1,5 @@
 """Filters without a shift in time, derivatives, and what raw samples are like: noise, jumps, steps."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaximp.models import ArmGeometry
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Movements
 from jaximp.recordings.load import recording_from_arrays, save_trial_table
 from jaximp.simulation.neuromuscular import (

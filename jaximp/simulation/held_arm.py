@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 
-from jaximp.models import ArmGeometry, mass_matrix, rigid_body_torque, solve_pair
+from jaximp.models.arm import mass_matrix, rigid_body_torque
+from jaximp.models.kinematics import ArmGeometry, solve_pair
 from jaximp.motion.trajectories import MinimumJerk, array_field
 from jaximp.types import AnyArray
 

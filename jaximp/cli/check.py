@@ -1,0 +1,56 @@
+"""`jaximp check`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from jaximp.cli.terminal import JobFile, bar_of
+
+if TYPE_CHECKING:
+    from jaximp.jobs.job import Job
+
+
+def check(job_file: JobFile) -> None:
+    """Look at a recording before a run: sampling, gaps, saturation, noise, delay, excitation.
+
+    Proposes cut-off frequencies and a window for the job file. Of perturbation trials it says how many there are, and
+    what the sensors allow.
+    """
+    from jaximp.jobs.job import read_job
+    from jaximp.jobs.run import check as check_recording
+
+    job = read_job(job_file)
+    if job.trials is not None:
+        _check_trials(job)
+        return
+    with bar_of("checking") as progress:
+        findings, proposal = check_recording(job, job.load(), job.load_robot_alone(), progress)
+    table = Table("", "checked", "found", box=None, pad_edge=False)
+    colour = {"ok": "green", "look": "yellow", "bad": "red"}
+    for finding in findings:
+        table.add_row(f"[{colour[finding.verdict]}]{finding.verdict}[/]", finding.topic, finding.text)
+    Console().print(table)
+    window = "" if proposal.window is None else f"\n[window]\nlength = {proposal.window:g}"
+    typer.echo(
+        f"\n# proposed: {proposal.why}\n[filter]\nposition_cutoff = {proposal.position_cutoff:g}\n"
+        f"decimation_cutoff = {proposal.decimation_cutoff:g}{window}"
+    )
+
+
+def _check_trials(job: Job) -> None:
+    """How many trials were read, and what reading says of them."""
+    from jaximp.perturbation.impedance import DISAGREEMENT
+    from jaximp.perturbation.movement_trials import handle_disagreement
+
+    for table in job.tables_of_trials():
+        perturbed, unperturbed, notes = table.load()
+        kind = "perturbed postures" if table.task == "posture" else "perturbed movements"
+        others = 0 if unperturbed is None else len(unperturbed)
+        typer.echo(f"{len(perturbed)} {kind}" + (f", {others} unperturbed ones" if table.task != "posture" else ""))
+        share, disagreement = handle_disagreement(perturbed, table.known_handle())
+        for note in (*notes, *([disagreement] if share > DISAGREEMENT[0] else [])):
+            typer.echo(f"- {note}")

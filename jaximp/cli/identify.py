@@ -1,0 +1,94 @@
+"""`jaximp identify`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
+
+import typer
+
+from jaximp.cli.terminal import Force, JobFile, Out, bar_of, say_where
+
+if TYPE_CHECKING:
+    from jaximp.identification.estimates import Estimates
+    from jaximp.jobs.job import Job
+    from jaximp.perturbation.impedance import ArmImpedance
+
+
+def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
+    """Estimate the parameters in every window of a recording, or the impedance of an arm from perturbation trials.
+
+    Writes estimates.parquet (one row per window, or one per method), summary.json, report.html and the figures into
+    the folder.
+    """
+    from jaximp.jobs.job import read_job
+    from jaximp.recordings.outputs import new_folder
+
+    job = read_job(job_file)
+    with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
+        identify_into(job, folder)
+    say_where(out)
+
+
+def identify_into(job: Job, folder: Path) -> None:
+    if job.trials is not None:
+        _identify_trials_into(job, folder)
+        return
+    from jaximp.identification.identify import at_other_lengths, in_windows
+    from jaximp.jobs.run import prepare
+
+    # Figures take long to import: that is done while the other core compiles.
+    Thread(target=import_module, args=("jaximp.reports.estimates",)).start()
+    with bar_of("identifying") as progress:
+        recording, alone = job.load(), job.load_robot_alone()
+        progress(0.1)
+        prepared = prepare(job, recording, alone)
+        progress(0.3)
+        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
+        others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
+        from jaximp.reports.estimates import write_results
+
+        write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
+        progress(1.0)
+    _say_result(estimates[0])
+
+
+def _identify_trials_into(job: Job, folder: Path) -> None:
+    from jaximp.perturbation.impedance import identify_trials
+
+    Thread(target=import_module, args=("jaximp.reports.impedance",)).start()
+    with bar_of("identifying") as progress:
+        result = identify_trials(job, lambda share: progress(0.8 * share))
+        from jaximp.reports.impedance import write_trials_results
+
+        write_trials_results(folder, result, job)
+        progress(1.0)
+    for estimate in result.estimates:
+        _say_impedance(estimate)
+    for note in result.main.notes:
+        typer.echo(f"note: {note}")
+
+
+def _say_result(estimates: Estimates) -> None:
+    counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
+    typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    complaint = estimates.verdicts.complaint()
+    if complaint:
+        typer.echo(complaint)
+        return
+    typer.echo("mean and standard deviation over the trusted windows:")
+    shown = estimates.summarised()
+    found = zip(shown.names, shown.units, shown.mean_over_trusted(), shown.sd_over_trusted(), strict=True)
+    for name, unit, mean, sd in found:
+        typer.echo(f"{name:>20} {mean:11.4g} ({sd:.2g}) {unit}")
+
+
+def _say_impedance(found: ArmImpedance) -> None:
+    typer.echo(f"{found.title}: {found.trials} perturbed trials, {1e3 * found.window:g} ms after the onset")
+    for name, unit, value, stderr in zip(found.names, found.units, found.theta, found.stderr, strict=True):
+        typer.echo(f"{name:>20} {value:11.4g} ({stderr:.2g}) {unit}")
+    typer.echo(f"verdict: {found.verdict}" + (f": {found.reason}" if found.reason else ""))
+    for warning in found.warnings:
+        typer.echo(f"warning: {warning}")

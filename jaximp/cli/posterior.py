@@ -1,0 +1,28 @@
+"""`jaximp posterior`."""
+
+from __future__ import annotations
+
+import typer
+
+from jaximp.cli.terminal import Force, JobFile, Out, bar_of, say_where
+
+
+def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
+    """Draw from the posterior of the parameters: of a whole recording and of its windows, or of an arm's impedance.
+
+    Writes the draws as NetCDF for ArviZ, summary.json, report.html and the figures into the folder.
+    """
+    from jaximp.jobs.job import read_job
+    from jaximp.jobs.run import infer, infer_trials
+    from jaximp.recordings.outputs import new_folder
+    from jaximp.reports.posterior import write_arm_posterior, write_posterior_results
+
+    job = read_job(job_file)
+    with new_folder(out, force, inputs=[job_file, *job.files()]) as folder, bar_of("sampling") as progress:
+        if job.trials is None:
+            content = write_posterior_results(folder, infer(job, lambda share: progress(0.9 * share)), job)
+        else:
+            content = write_arm_posterior(folder, *infer_trials(job, lambda share: progress(0.9 * share)), job)
+    for line in [f"not to be trusted: {content['why']}"] if content["why"] else content["sentences"]:
+        typer.echo(line)
+    say_where(out)

@@ -1,0 +1,67 @@
+"""`jaximp simulate`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from jaximp.cli.terminal import Force, Out, Seed, bar_of
+
+
+class What(StrEnum):
+    """What can be simulated."""
+
+    rig = "rig"
+    arm = "arm"
+
+
+class Holding(StrEnum):
+    """What holds the handle of the simulated rig."""
+
+    spring = "spring"
+    bands = "bands"
+
+
+class Format(StrEnum):
+    """What simulated trials are written as."""
+
+    parquet = "parquet"
+    csv = "csv"
+
+
+def simulate(
+    what: What,
+    out: Out,
+    force: Force = False,
+    seed: Seed = 0,
+    holding: Annotated[Holding, typer.Option("--holding", help="rig: what holds the handle.")] = Holding.spring,
+    perturbed: Annotated[int, typer.Option("--perturbed", help="arm: how many movements are perturbed.")] = 20,
+    unperturbed: Annotated[int, typer.Option("--unperturbed", help="arm: how many are not.")] = 40,
+    duration: Annotated[float, typer.Option("--duration", help="arm: of a movement, in s.")] = 2.0,
+    position_step: Annotated[float, typer.Option("--position-step", help="arm: step of the encoders, in um.")] = 1.0,
+    force_noise: Annotated[float, typer.Option("--force-noise", help="arm: white noise of the force, in N.")] = 0.0,
+    format: Annotated[Format, typer.Option("--format", help="arm: of the recordings.")] = Format.parquet,
+) -> None:
+    """Write simulated recordings, with a job file that `identify` reads.
+
+    `rig`: a rig of one joint, alone and held. `arm`: reaching movements of an arm whose hand is perturbed at times, and
+    postures that it keeps; truth.json holds what is to be found.
+    """
+    from jaximp.recordings.outputs import new_folder
+
+    with new_folder(out, force) as folder, bar_of("simulating") as progress:
+        if what is What.rig:
+            from jaximp.simulation.rig_recordings import write_rig_recordings
+
+            write_rig_recordings(folder, holding.value, seed)
+        else:
+            from jaximp.simulation.arm_recordings import Sensors, write_arm_recordings
+
+            write_arm_recordings(
+                folder, perturbed=perturbed, unperturbed=unperturbed, duration=duration, seed=seed,
+                sensors=Sensors(1e-6 * position_step, force_noise), format=format.value, progress=progress,
+            )  # fmt: skip
+        progress(1.0)
+    typer.echo(f"recordings and job: {out}\nnext: jaximp identify {out / 'job.toml'} --out {out.name}-results")

@@ -1,0 +1,36 @@
+"""What the commands share: their options, a bar of progress, and what they say at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:  # a command imports what it needs when it runs: `--help` must not wait for it
+    from jaximp.types import Progress
+
+console = Console(stderr=True, highlight=False)
+
+JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to identify, from which recording.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must not exist yet.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a folder that jaximp wrote earlier.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the simulated noise.")]
+
+
+@contextmanager
+def bar_of(task: str) -> Iterator[Progress]:
+    """A bar on the terminal, nothing where there is none."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        name = bar.add_task(task, total=1.0)
+        yield lambda share: bar.update(name, completed=share)
+
+
+def say_where(out: Path) -> None:
+    typer.echo(f"report: {(out / 'report.html').resolve()}")

@@ -1,0 +1,16 @@
+from .noise import Noise as Noise
+from .noise import WhiteRows as WhiteRows
+from .noise import fit_noise as fit_noise
+from .noise import joined as joined
+from .noise import whiten as whiten
+from .recursive import RecursiveFit as RecursiveFit
+from .recursive import recursive_least_squares as recursive_least_squares
+from .sliding import adaptive_least_squares as adaptive_least_squares
+from .sliding import sliding_least_squares as sliding_least_squares
+from .sliding import sliding_pieces as sliding_pieces
+from .sliding import sliding_theta as sliding_theta
+from .window import SlidingFit as SlidingFit
+from .window import WindowFit as WindowFit
+from .window import confidence_interval as confidence_interval
+from .window import least_squares as least_squares
+from .window import variance_accounted_for as variance_accounted_for

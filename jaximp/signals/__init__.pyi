@@ -1,0 +1,12 @@
+from .filters import autocovariance as autocovariance
+from .filters import butterworth as butterworth
+from .filters import central_differences as central_differences
+from .filters import fill_gaps as fill_gaps
+from .filters import filter_from_zero as filter_from_zero
+from .filters import filter_zero_phase as filter_zero_phase
+from .filters import jumps as jumps
+from .filters import noise_level as noise_level
+from .filters import quantisation_step as quantisation_step
+from .filters import savitzky_golay as savitzky_golay
+from .filters import savitzky_golay_gain as savitzky_golay_gain
+from .filters import savitzky_golay_half_length as savitzky_golay_half_length
