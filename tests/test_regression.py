@@ -11,7 +11,7 @@ from jaximp.identification.regression import Filters, design_filters, noise_of_r
 from jaximp.jobs.job import FilterSettings, HumanSettings, Job, ModelSettings, RobotSettings, WindowSettings
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
-from jaximp.signals.filters import central_differences
+from jaximp.signals import central_differences
 from jaximp.types import Recording
 
 RATE = 1000.0

@@ -34,11 +34,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import coverage  # noqa: E402
 from stiffness_fits import D, K, machine, trials  # noqa: E402
 
-from jaximp import merge_triangles, residual_triangle  # noqa: E402
+from jaximp import (  # noqa: E402
+    merge_triangles,
+    residual_triangle,
+    signals,
+)
 from jaximp.posterior.densities import Density, stiffness_density, window_densities  # noqa: E402
 from jaximp.posterior.draws import PosteriorMany, exact_posterior  # noqa: E402
 from jaximp.posterior.samplers import sample_many, sample_posterior  # noqa: E402
-from jaximp.signals import filters as signals  # noqa: E402
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)

@@ -45,7 +45,7 @@ def ours(what: str, n: int, p: int, window: int, repeats: int = 5) -> dict[str, 
 
     jax.config.update("jax_enable_x64", True)
     import jaximp
-    from jaximp.signals.filters import autocovariance, butterworth
+    from jaximp.signals import autocovariance, butterworth
 
     W, y = data(n, p)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

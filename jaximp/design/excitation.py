@@ -32,7 +32,8 @@ from jaximp.design.optimise import METHODS, minimise, onto_polytope
 from jaximp.least_squares.chunks import cores
 from jaximp.models import Model
 from jaximp.motion.trajectories import FourierSeries, at_rest, jerk
-from jaximp.signals.filters import butterworth, central_differences, require_float64
+from jaximp.numerics.precision import require_float64
+from jaximp.signals import butterworth, central_differences
 from jaximp.types import AnyArray, Numbers, Progress, nearest
 
 OBJECTIVES = {

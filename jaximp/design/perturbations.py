@@ -21,7 +21,7 @@ from jaximp.design.objectives import log_condition
 from jaximp.design.optimise import Found, minimise
 from jaximp.models import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers
 
 SAMPLES = 120

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.identify import Estimates, identify_recording, jump_note
 from jaximp.identification.regression import design_filters, jumped, regress
 from jaximp.jobs.job import Job
 from jaximp.models import combine
-from jaximp.signals import filters as signals
 from jaximp.trust.verdicts import NEGATIVE, NO_DATA, WEAK
 from jaximp.types import Progress, Recording
 

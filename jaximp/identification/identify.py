@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.regression import (
     Filters,
     Placement,
@@ -34,7 +35,7 @@ from jaximp.jobs.job import Job
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models import Joints, Model, combine, pathway_of, with_gain
-from jaximp.signals import filters as signals
+from jaximp.numerics.precision import require_float64
 from jaximp.trust.verdicts import Verdicts, fake_change_threshold, judge, worst
 from jaximp.types import AnyArray, Progress, Recording, nearest
 
@@ -241,7 +242,7 @@ def prepare(job: Job, recording: Recording, alone: Recording | None = None) -> P
 
 def checked_models(job: Job, recording: Recording) -> tuple[Model | None, Model | None, Filters]:
     """Robot's and human's model and the filters, for a recording that suits the job."""
-    signals.require_float64(recording.position)
+    require_float64(recording.position)
     check_window(job, recording)
     robot, human = job.models(recording.joints, recording.sample_rate)
     if job.model.arm is not None:

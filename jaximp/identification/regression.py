@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.jobs.job import FilterSettings, Job
 from jaximp.least_squares.chunks import cores
 from jaximp.least_squares.sliding import slice_window, window_starts
 from jaximp.models import MOTION, Model
-from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 
 LARGEST_BLOCKS = 200_000_000

@@ -27,6 +27,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.identify import Prepared, Solved, checked_models, moments, reference_motion
 from jaximp.identification.regression import (
     Filters,
@@ -47,7 +48,6 @@ from jaximp.least_squares.sliding import Score, score, sliding_least_squares, wi
 from jaximp.least_squares.window import variance_accounted_for
 from jaximp.models import Joints, Model
 from jaximp.numerics.compilation import compiled
-from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 
 STACKED_SAMPLES = 400_000

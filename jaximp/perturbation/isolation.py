@@ -25,7 +25,7 @@ from jaximp.models import ArmGeometry, PlanarArm, borner_from_lakatos, lakatos_f
 from jaximp.motion.trajectories import array_field
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Handle, Movements, cut_at_onset
 from jaximp.perturbation.output_error import output_error
-from jaximp.signals.filters import butterworth, central_differences, filter_zero_phase
+from jaximp.signals import butterworth, central_differences, filter_zero_phase
 from jaximp.types import AnyArray, Numbers
 
 FILTER_ORDER = 10

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp.models import ArmGeometry
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Handle, Movements
-from jaximp.signals.filters import (
+from jaximp.signals import (
     butterworth,
     fill_gaps,
     filter_zero_phase,
     noise_level,
     quantisation_step,
-    require_float64,
     savitzky_golay,
     savitzky_golay_gain,
     savitzky_golay_half_length,

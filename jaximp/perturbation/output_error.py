@@ -65,8 +65,8 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import t as student
 
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Deviations, Handle, Movements
-from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers
 
 BIN = 0.005

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 from numpy.typing import NDArray
 
 from jaximp.numerics.definite import Semidefinite, back_substitute, semidefinite_least_squares, triangle
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
 FEWEST_TRIALS = 5

@@ -23,7 +23,7 @@ from jaximp.least_squares.window import WindowFit, least_squares, variance_accou
 from jaximp.models import ArmGeometry, PlanarArm, solve_pair
 from jaximp.perturbation.movement_trials import NOISE, check_directions, check_hand, find_onset, trial_name
 from jaximp.recordings.load import load_recording
-from jaximp.signals.filters import kept_variance
+from jaximp.signals import kept_variance
 from jaximp.types import AnyArray, Recording
 
 STEADY = 0.005

@@ -21,7 +21,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import digamma, ndtri, polygamma
 from scipy.stats import rankdata, t
 
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers, nearest
 
 RHAT_MOST = 1.05

@@ -36,6 +36,7 @@ from jaximp.least_squares.noise import (
     whiteness,
 )
 from jaximp.models import Joints, Model, pathway_of
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.impedance import ArmImpedance, identify_trials
 from jaximp.posterior.densities import (
     Density,
@@ -49,7 +50,6 @@ from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_poste
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import MultivariateNormal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
-from jaximp.signals.filters import require_float64
 from jaximp.trust.verdicts import TRUSTED, Verdicts
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 

@@ -1,1 +1,67 @@
-"""Filters without a shift in time, derivatives, and what raw samples are like: noise, jumps, steps."""
+"""Sampled signals: filters, derivatives, and what raw samples are like."""
+
+from jaximp.signals.derivatives import (
+    central_differences,
+    central_differences_padded,
+    differences_in_windows,
+    savitzky_golay,
+    savitzky_golay_gain,
+    savitzky_golay_half_length,
+)
+from jaximp.signals.filters import (
+    CutSignal,
+    PaddedFilter,
+    Sections,
+    autocovariance,
+    butterworth,
+    check_long_enough,
+    cut_signal,
+    filter_from_zero,
+    filter_in_windows,
+    filter_zero_phase,
+    filter_zero_phase_padded,
+    kept_variance,
+    padded_filter,
+    reach,
+    zero_phase_matrix,
+)
+from jaximp.signals.samples import (
+    fill_gaps,
+    jumps,
+    lengthen_gaps,
+    long_gaps,
+    noise_level,
+    quantisation_step,
+    widen_gaps,
+)
+
+__all__ = [
+    "CutSignal",
+    "PaddedFilter",
+    "Sections",
+    "autocovariance",
+    "butterworth",
+    "central_differences",
+    "central_differences_padded",
+    "check_long_enough",
+    "cut_signal",
+    "differences_in_windows",
+    "fill_gaps",
+    "filter_from_zero",
+    "filter_in_windows",
+    "filter_zero_phase",
+    "filter_zero_phase_padded",
+    "jumps",
+    "kept_variance",
+    "lengthen_gaps",
+    "long_gaps",
+    "noise_level",
+    "padded_filter",
+    "quantisation_step",
+    "reach",
+    "savitzky_golay",
+    "savitzky_golay_gain",
+    "savitzky_golay_half_length",
+    "widen_gaps",
+    "zero_phase_matrix",
+]

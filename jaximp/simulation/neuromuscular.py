@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 from jaximp.models import ArmGeometry, coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque, solve_pair
 from jaximp.motion.trajectories import MinimumJerk, RaisedSine, array_field
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Handle, Movements
-from jaximp.signals.filters import butterworth, filter_from_zero
+from jaximp.signals import butterworth, filter_from_zero
 from jaximp.types import AnyArray
 
 MUSCLES = (
