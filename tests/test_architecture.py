@@ -65,9 +65,8 @@ STILL_UP = {
     ("identification.check", "jobs"), ("identification.identify", "jobs"), ("identification.regression", "jobs"),
     ("identification.stacks", "jobs"), ("perturbation.impedance", "jobs"), ("perturbation.trials", "jobs"),
     ("posterior.inference", "jobs"),
-    ("numerics.definite", "least_squares"), ("perturbation.isolation", "design"), ("perturbation.trials", "design"),
 }  # fmt: skip
-"""Numerical code that still takes the job as its argument, and linear algebra that has no room of its own yet."""
+"""Numerical code that still takes the job as its argument."""
 
 
 @every_module

@@ -28,10 +28,10 @@ from jaxtyping import Array
 
 from jaximp.design.bounds import condition_bound
 from jaximp.design.objectives import log_condition, log_sigma_min, log_stderr, log_volume
-from jaximp.design.optimise import METHODS, minimise, onto_polytope
 from jaximp.least_squares.chunks import cores
 from jaximp.models import Model
 from jaximp.motion.trajectories import FourierSeries, at_rest, jerk
+from jaximp.numerics.optimise import METHODS, minimise, onto_polytope
 from jaximp.numerics.precision import require_float64
 from jaximp.signals import butterworth, central_differences
 from jaximp.types import AnyArray, Numbers, Progress, nearest

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, Num, Shaped
 
 from jaximp.design.excitation import Limits, room
 from jaximp.design.objectives import log_condition
-from jaximp.design.optimise import Found, minimise
 from jaximp.models import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk
+from jaximp.numerics.optimise import Found, minimise
 from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers
 

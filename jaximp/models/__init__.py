@@ -22,7 +22,7 @@ from jaximp.models.endpoint import (
     propagated_stderr,
 )
 from jaximp.models.joint import HumanJoint, RobotJoint, parameter_units
-from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.models.reflex import ReflexGain, ReflexPathway, pathway_of, reflex_gain, with_gain
 
 __all__ = [
@@ -56,6 +56,5 @@ __all__ = [
     "propagated_stderr",
     "reflex_gain",
     "rigid_body_torque",
-    "solve_pair",
     "with_gain",
 ]

@@ -431,7 +431,7 @@ def exact_posterior(
 
 @eqx.filter_jit
 def _draw_exact(posterior: ExactPosterior, key: PRNGKeyArray, n: int) -> Array:
-    from jaximp.numerics.definite import back_substitute
+    from jaximp.numerics.linear_algebra import back_substitute
 
     normal_key, chi_key = jax.random.split(key)
     dof, scale = jnp.asarray(posterior.dof), jnp.asarray(posterior.scale)
