@@ -36,10 +36,10 @@ from scipy.signal import lfilter
 from scipy.stats import chi2, chisquare
 from scipy.stats import t as student
 
+from jaximp import signals
 from jaximp.least_squares import Noise, WhiteRows, fit_noise, whiten
 from jaximp.posterior import sample_many, sample_posterior
 from jaximp.posterior.densities import STIFFNESS, Density, linear_density, stiffness_density
-from jaximp.signals import filters as signals
 
 jax.config.update("jax_enable_x64", True)
 

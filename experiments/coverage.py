@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from jaximp import signals
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import HumanJoint
-from jaximp.signals import filters as signals
 from jaximp.simulation import ROBOT_TRAJECTORY, HumanLoad, Rig, simulate_rig
 
 jax.config.update("jax_enable_x64", True)

@@ -63,9 +63,8 @@ def called(module: str) -> Iterator[str]:
 
 STILL_UP = {
     ("perturbation.impedance", "jobs"),
-    ("numerics.definite", "least_squares"), ("perturbation.isolation", "design"), ("perturbation.trials", "design"),
 }  # fmt: skip
-"""Numerical code that still takes the job as its argument, and linear algebra that has no room of its own yet."""
+"""Numerical code that still takes the job as its argument."""
 
 
 @every_module

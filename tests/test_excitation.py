@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from jaximp.design import excitation, objectives
 from jaximp.design.bounds import condition_bound
 from jaximp.design.excitation import Design, Encoder, Limits, design_excitation
-from jaximp.design.optimise import METHODS, minimise, onto_polytope
 from jaximp.models import HumanJoint, Joints, Model, RobotJoint
 from jaximp.motion.trajectories import FourierSeries, jerk
+from jaximp.numerics.optimise import METHODS, minimise, onto_polytope
 
 Numbers = NDArray[np.float64]
 HUMAN, ROBOT = HumanJoint(offset=False), RobotJoint(gear_ratio=15)

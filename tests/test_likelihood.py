@@ -18,6 +18,7 @@ from scipy.signal import fftconvolve, lfilter
 from scipy.stats import chi2, kstest, lognorm, multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student
 
+from jaximp import signals
 from jaximp.least_squares.noise import (
     Noise,
     attenuation,
@@ -47,7 +48,6 @@ from jaximp.posterior.densities import (
 )
 from jaximp.posterior.predictive import log_score, log_scores, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, make_prior
-from jaximp.signals import filters as signals
 
 Numbers = NDArray[np.float64]
 

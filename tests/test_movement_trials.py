@@ -31,7 +31,7 @@ from jaximp.recordings.load import (
     save_recording,
     save_trial_table,
 )
-from jaximp.signals.filters import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
+from jaximp.signals import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
 from jaximp.simulation.arm_recordings import Sensors, arm_movements, as_recordings
 from jaximp.simulation.neuromuscular import ANGLES, POSTURES, NeuromuscularArm, Reaches, hold_posture
 from jaximp.types import Recording

@@ -13,7 +13,7 @@ from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
-from jaximp.signals.filters import central_differences
+from jaximp.signals import central_differences
 from jaximp.types import Recording
 
 RATE = 1000.0

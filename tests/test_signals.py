@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
-from jaximp.signals.filters import (
+from jaximp.numerics.precision import require_float64
+from jaximp.signals import (
     autocovariance,
     butterworth,
     central_differences,
@@ -25,7 +26,6 @@ from jaximp.signals.filters import (
     noise_level,
     quantisation_step,
     reach,
-    require_float64,
     widen_gaps,
     zero_phase_matrix,
 )

@@ -122,7 +122,7 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         print(json.dumps(measured(*sys.argv[1:3])))
         sys.exit(0)
-    from jaximp.design.optimise import METHODS
+    from jaximp.numerics.optimise import METHODS
 
     found = {
         problem: {method: measure(problem, method) for method in METHODS if problem in PROBLEMS[:3] or method == "bfgs"}

@@ -34,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import coverage  # noqa: E402
 from stiffness_fits import D, K, machine, trials  # noqa: E402
 
+from jaximp import signals  # noqa: E402
 from jaximp.perturbation import merge_triangles, residual_triangle  # noqa: E402
 from jaximp.posterior import (  # noqa: E402
     Density,
@@ -44,7 +45,6 @@ from jaximp.posterior import (  # noqa: E402
     stiffness_density,
     window_densities,
 )
-from jaximp.signals import filters as signals  # noqa: E402
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, Num, Shaped
 
 from jaximp.design.excitation import Limits, room
 from jaximp.design.objectives import log_condition
-from jaximp.design.optimise import Found, minimise
 from jaximp.models.arm import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.optimise import Found, minimise
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers
 
 SAMPLES = 120

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate, jump_note
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine
-from jaximp.signals import filters as signals
 from jaximp.trust.verdicts import NEGATIVE, NO_DATA, WEAK
 from jaximp.types import Progress, Recording
 

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.signals import filters as signals
+from jaximp import signals
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.filters import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows, measured_motion, undisturbed
 from jaximp.least_squares.chunks import cores
 from jaximp.least_squares.sliding import slice_window, window_starts
 from jaximp.models.base import MOTION, Model
-from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 
 LARGEST_BLOCKS = 200_000_000

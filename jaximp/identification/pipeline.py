@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 import jax.numpy as jnp
 import numpy as np
 
+from jaximp import signals
 from jaximp.identification.filters import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries
-from jaximp.signals import filters as signals
+from jaximp.numerics.precision import require_float64
 from jaximp.trust.verdicts import TrustLimits
 from jaximp.types import AnyArray, Recording
 
@@ -94,7 +95,7 @@ class Pipeline:
 
     def check(self, recording: Recording) -> None:
         """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees."""
-        signals.require_float64(recording.position)
+        require_float64(recording.position)
         duration = len(recording) / recording.sample_rate
         if round(self.window.length * recording.sample_rate) > len(recording):
             raise ValueError(

@@ -26,11 +26,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.filters import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
 from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled
-from jaximp.signals import filters as signals
 from jaximp.types import AnyArray, Recording
 
 T = TypeVar("T")

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design.excitation import OBJECTIVES, Design, Encoder, Limits, design_excitation
-from jaximp.design.optimise import METHODS
 from jaximp.jobs.job import ModelSettings, model_settings
 from jaximp.jobs.settings import check_keys, checked, read, settings
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.joint import RobotJoint
+from jaximp.numerics.optimise import METHODS
 from jaximp.types import Progress, nearest
 
 

@@ -31,7 +31,7 @@ to the QR decomposition of `least_squares`, one by one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -41,19 +41,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaximp.numerics.compilation import keep
+from jaximp.numerics.lanes import Rows, cholesky, extreme_singular_values, substitute, sum_of
+
 BLOCK = 16
 """Rows in a block, at least."""
 FEWEST_LANES = 30
 """XLA breaks off the whole process where it compiles the barriers for only a few lanes."""
 DOUBT = 1e-2
 """A pivot below this share of its column leaves the window's estimate to a QR decomposition."""
-WELL_CONDITIONED = 4e7
-"""Ratio of a Gram matrix's eigenvalues, in units of rounding, down to which the smaller is accurate enough."""
-MOST_ITERATIONS = 40
-"""Of Laguerre's method: it converges cubically, but where two eigenvalues nearly coincide."""
-
-Rows = tuple[Array, ...]
-"""Upper triangle of a symmetric matrix per lane: entry i holds row i from the diagonal on, (p - i, lanes)."""
 
 
 class Plan(NamedTuple):
@@ -267,11 +263,6 @@ def _meets(fit: ChunkFit, wanted: Wanted) -> Array:
     accurate = fit.share > jnp.sqrt(jnp.finfo(fit.theta.dtype).eps)
     sure = (fit.statistics.stderr <= wanted.stderr[:, None]).all(axis=0)
     return fit.solvable & accurate & sure & (fit.statistics.sigma_max <= wanted.cond * fit.statistics.sigma_min)
-
-
-def keep(x: Any) -> Any:
-    """Write these numbers to memory: whoever needs them must not compute them again."""
-    return lax.optimization_barrier(x)
 
 
 def _features(plan: Plan, columns: Array, scale: Array, noise: Array | None) -> tuple[Array, Array]:
@@ -527,7 +518,7 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
     weight, vaf, _, samples = _residuals(plan, rss, inner, R, sums)
     constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
     own_inverse, given, inverse = _triangle_and_inverses(constant, R[:p, :p])
-    sigma_max, sigma_min = _extreme_singular_values(given, inverse)
+    sigma_max, sigma_min = extreme_singular_values(given, inverse)
     norm = jnp.sqrt((inverse**2).sum(axis=1))
     if across is None or noise is None:
         dof = samples - p
@@ -536,28 +527,6 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
         stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, weight)
     statistics = Statistics(stderr, dof, norm, sigma_max, sigma_min, rss / weight, vaf, samples)
     return ChunkFit(theta, solvable, share, statistics)
-
-
-def cholesky(sums: Rows) -> Rows:
-    """Upper triangle with `R'R` the given matrix, row by row; a pivot that is not positive becomes one."""
-    triangle: list[Array] = []
-    for j, row in enumerate(sums):
-        rest = row
-        for i, above in enumerate(triangle):
-            rest = rest - above[j - i] * above[j - i :]
-        triangle.append(keep(rest * lax.rsqrt(jnp.where(rest[0] > 0, rest[0], 1))))
-    return tuple(triangle)
-
-
-def substitute(triangle: Rows, p: int) -> list[Array]:
-    """Back through the window's triangle: the estimate in the chunk's coordinates."""
-    inner: list[Array] = list(triangle[:p])
-    for i in reversed(range(p)):
-        rest = triangle[i][p - i]
-        for k in range(i + 1, p):
-            rest = rest - triangle[i][k - i] * inner[k]
-        inner[i] = keep(rest / triangle[i][0])
-    return inner
 
 
 def _solvable(pivots: Array, sums: Rows, R: Array, rows: int) -> Array:
@@ -614,7 +583,7 @@ def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan, ahead: Arra
     inner = list(keep(_one_after_another(found.theta, plan).T))
     # The residual is this combination of the chunk's columns; its sum of squares, a quadratic form of theirs.
     along = [*(-theta for theta in inner), jnp.ones_like(inner[0])]
-    square = _total(
+    square = sum_of(
         along[i] * ((1 if i == k else 2) * along[k]) * row[k - i]
         for i, row in enumerate(rows[: p + 1])
         for k in range(i, p + 1)
@@ -647,7 +616,7 @@ def _residuals(plan: Plan, rss: Array, inner: list[Array], R: Array, sums: Rows)
 def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Array]:
     """Inverse of the window's triangle, the triangle in the given units, and the inverse of that; (p, p, lanes)."""
     p, scale = len(R), R[:, :, None]
-    given = keep(jnp.stack([_total(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
+    given = keep(jnp.stack([sum_of(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
     own = list(jnp.eye(p, dtype=R.dtype)[:, :, None] * jnp.ones_like(given[0, 0]))
     for i in reversed(range(p)):
         rest = own[i]
@@ -671,12 +640,12 @@ def _coloured(
     p = len(own)
     within = keep(tuple(all_ - lost for all_, lost in zip(sums[-len(across) :], across, strict=True)))
     once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
-    half = keep(jnp.stack([_total(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
-    shape = keep(jnp.stack([_total(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
-    gram = jnp.stack([_total(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
-    trace = noise[0] * weight - _total(shape[i, i] for i in range(p))
+    half = keep(jnp.stack([sum_of(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
+    shape = keep(jnp.stack([sum_of(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
+    gram = jnp.stack([sum_of(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
+    trace = noise[0] * weight - sum_of(shape[i, i] for i in range(p))
     square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
-    spread = keep(jnp.stack([_total(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
+    spread = keep(jnp.stack([sum_of(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))
     return jnp.sqrt(variance), trace**2 / square
 
@@ -685,107 +654,3 @@ def _full(triangle: Rows) -> Array:
     """Symmetric (p, p, lanes) from the rows of its upper triangle."""
     above = [[triangle[k][i - k][None] for k in range(i)] for i in range(len(triangle))]
     return keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))
-
-
-def _extreme_singular_values(given: Array, inverse: Array) -> tuple[Array, Array]:
-    """Largest and smallest singular value of the triangle `given`, as eigenvalues of its Gram matrix.
-
-    The smallest of these drowns in rounding where the matrix is ill conditioned; there it is found as the largest of
-    the inverse, which does not. What a window gets does not depend on the other lanes.
-    """
-    p, rounding = len(given), jnp.finfo(given.dtype).eps
-
-    def gram() -> Array:
-        return jnp.stack([_total(given[k, i] * given[k] for k in range(i + 1)) for i in range(p)])
-
-    def inverse_gram() -> Array:
-        return jnp.stack([_total(inverse[i, k] * inverse[:, k] for k in range(i, p)) for i in range(p)])
-
-    def drowned(largest: Array, smallest: Array) -> Array:
-        return smallest < WELL_CONDITIONED * rounding * largest
-
-    def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        count, largest, smallest = state
-        return (count == 0) | ((count == 1) & drowned(largest, smallest).any())
-
-    def find(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, largest, smallest = state
-        low, high = extreme_eigenvalues(keep(lax.cond(count == 0, gram, inverse_gram)))
-        again = jnp.where(drowned(largest, smallest), 1 / high, smallest)
-        return keep((count + 1, jnp.where(count == 0, high, largest), jnp.where(count == 0, low, again)))
-
-    nothing = jnp.zeros_like(given[0, 0])
-    _, largest, smallest = lax.while_loop(unfinished, find, (jnp.zeros((), int), nothing, nothing))
-    return jnp.sqrt(largest), jnp.sqrt(smallest)
-
-
-def extreme_eigenvalues(matrix: Array) -> tuple[Array, Array]:
-    """Smallest and largest eigenvalue of positive semidefinite (p, p, lanes)."""
-    diagonal, squares = _tridiagonal(matrix)
-    high = _largest_root(diagonal, squares, _upper_bound(diagonal, squares))
-    return -_largest_root(-diagonal, squares, jnp.zeros_like(high)), high
-
-
-def _tridiagonal(matrix: Array) -> tuple[Array, Array]:
-    """Diagonal (p, lanes) and squared off-diagonal of Householder's tridiagonal form of symmetric (p, p, lanes)."""
-    diagonal, squares = [], []
-    while len(matrix) > 2:
-        diagonal.append(matrix[0, 0])
-        x = matrix[1:, 0]
-        square = (x**2).sum(axis=0)
-        squares.append(square)
-        head = -jnp.copysign(jnp.sqrt(square), x[0])
-        half = square - head * x[0]  # half the squared length of the reflected vector
-        over = jnp.where(half > 0, 1 / jnp.where(half > 0, half, 1), 0)
-        v, over = keep((jnp.concatenate([x[:1] - head, x[1:]]), over))
-        rest = matrix[1:, 1:]
-        image = keep(_total(rest[k] * v[k] for k in range(len(v))) * over)
-        w = keep(image - (over / 2) * (v * image).sum(axis=0) * v)
-        matrix = keep(rest - v[:, None] * w - w[:, None] * v)
-    diagonal += [matrix[k, k] for k in range(len(matrix))]
-    squares += [matrix[0, 1] ** 2] if len(matrix) == 2 else []
-    return keep((jnp.stack(diagonal), jnp.stack([*squares, jnp.zeros_like(diagonal[0])])))
-
-
-def _upper_bound(diagonal: Array, squares: Array) -> Array:
-    """Frobenius's norm: no eigenvalue is larger."""
-    return jnp.sqrt((diagonal**2).sum(axis=0) + 2 * squares.sum(axis=0)) * (1 + 8 * jnp.finfo(diagonal.dtype).eps)
-
-
-def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
-    """Largest eigenvalue of a tridiagonal matrix: Laguerre's iteration falls to it from above and never passes it.
-
-    A lane that has converged stays as it is while others go on.
-    """
-    p = len(diagonal)
-    small = 4 * jnp.finfo(diagonal.dtype).eps
-
-    def moving(value: Array, step: Array) -> Array:
-        return step > small * jnp.abs(value)
-
-    def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        value, step, count = state
-        return moving(value, step).any() & (count < MOST_ITERATIONS)
-
-    def improve(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        value, before, count = state
-        first = second = slope = curve = coupling = jnp.zeros_like(value)
-        above = jnp.ones(value.shape, bool)
-        for i in range(p):
-            # q = p_i / p_(i-1) by Sturm's recurrence, slope = q'/q, curve = q''/q
-            q = value - diagonal[i] - coupling
-            above &= q > 0
-            over = 1 / jnp.where(q > 0, q, 1)
-            slope, curve = (1 + coupling * slope) * over, coupling * (curve - 2 * slope**2) * over
-            coupling = squares[i] * over
-            first, second = first + slope, second + slope**2 - curve
-        root = jnp.sqrt(jnp.maximum((p - 1) * (p * second - first**2), 0))
-        step = jnp.where(above & moving(value, before), p / (first + root), 0)
-        return keep((value - step, step, count + 1))
-
-    return lax.while_loop(unfinished, improve, (start, jnp.full_like(start, jnp.inf), jnp.zeros((), int)))[0]
-
-
-def _total(terms: Iterable[Array]) -> Array:
-    first, *others = terms
-    return sum(others, first)

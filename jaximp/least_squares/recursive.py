@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, Shaped
 
-from jaximp.least_squares.engine import Rows, cholesky, keep, substitute
 from jaximp.least_squares.window import check_finite
-from jaximp.numerics.compilation import compiled
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.compilation import compiled, keep
+from jaximp.numerics.lanes import Rows, cholesky, substitute
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
 SINGULAR = 1e-14

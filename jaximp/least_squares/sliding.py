@@ -36,7 +36,7 @@ from jaximp.least_squares.window import (
     variance_accounted_for,
 )
 from jaximp.numerics.compilation import compiled
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
 BATCH_NUMBERS = 4_000_000

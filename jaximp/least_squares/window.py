@@ -13,13 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, Shaped
 from numpy.typing import NDArray
 
+from jaximp.numerics.linear_algebra import inverse_of_triangle, orthonormal, singular_values
 from jaximp.types import AnyArray
 
 DENSE_ROWS = 512
 """Up to so many rows the noise's covariance is multiplied as a matrix, beyond by fast Fourier transforms."""
-
-SWEEPS = 10
-"""Times that every pair of columns is turned against each other; the error falls with its square every time."""
 
 
 class Fit(eqx.Module):
@@ -101,10 +99,10 @@ def solve_window(W: AnyArray, y: AnyArray, scale: AnyArray, noise: AnyArray | No
     rows, torque = (W * scale[..., None]).reshape(-1, p), (y * scale).reshape(-1)
     n, weight = (scale > 0).sum().astype(W.dtype), scale**2
 
-    Q, R, independent = _orthonormal(rows)
-    singular = _singular_values(R)
+    Q, R, independent = orthonormal(rows)
+    singular = singular_values(R)
     solvable = (n >= p) & independent
-    inverse = _inverse_of_triangle(jnp.where(solvable, R, jnp.eye(p, dtype=R.dtype)))
+    inverse = inverse_of_triangle(jnp.where(solvable, R, jnp.eye(p, dtype=R.dtype)))
     theta = inverse @ (Q.T @ torque)
     residual = torque - rows @ theta
     rss = residual @ residual
@@ -169,74 +167,6 @@ def confidence_interval(
 
     half = t.ppf(0.5 + level / 2, np.asarray(dof))[..., None] * np.asarray(stderr)
     return np.asarray(theta) - half, np.asarray(theta) + half
-
-
-def _orthonormal(rows: Float[Array, "S p"]) -> tuple[Array, Array, Array]:
-    """`Q, R` with rows = Q R by Gram-Schmidt, every column orthogonalised twice, and whether the rank is full.
-
-    Twice is enough for orthogonality to rounding. Products of whole columns vectorise over windows, where batches of
-    small LAPACK calls do not (and several of them at a time can block each other on few cores). A column whose
-    independent part is lost in rounding makes the rank deficient, whatever its unit.
-    """
-    p = rows.shape[1]
-    negligible = rows.shape[0] * jnp.finfo(rows.dtype).eps
-
-    def add_column(j: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        Q, R, independent = state
-        column = rest = rows[:, j]
-        along = jnp.zeros(p, rows.dtype)
-        for _ in range(2):
-            part = Q.T @ rest
-            rest, along = rest - Q @ part, along + part
-        left = jnp.linalg.norm(rest)
-        independent &= left > negligible * jnp.linalg.norm(column)
-        return (
-            Q.at[:, j].set(rest / jnp.where(left > 0, left, 1)),
-            R.at[:, j].set(along.at[j].set(left)),
-            independent,
-        )
-
-    empty = jnp.zeros_like(rows), jnp.zeros((p, p), rows.dtype), jnp.array(True)
-    return jax.lax.fori_loop(0, p, add_column, empty)
-
-
-def _singular_values(R: Float[Array, "p p"]) -> Float[Array, " p"]:
-    """Singular values, largest first, by one-sided Jacobi rotations: columns are turned until they are orthogonal.
-
-    Accurate for the small values too, and free of LAPACK for the reason given above. Half of the columns meet the other
-    half at a time.
-    """
-    p = R.shape[0]
-    half = (p + 1) // 2
-    if p == 1:
-        return jnp.abs(R[0])
-
-    def rotate(_: Array, A: Array) -> Array:
-        a, b = A[:, :half], A[:, half:]
-        overlap = (a * b).sum(axis=0)
-        ratio = ((b * b).sum(axis=0) - (a * a).sum(axis=0)) / (2 * jnp.where(overlap == 0, 1, overlap))
-        tangent = jnp.where(ratio < 0, -1, 1) / (jnp.abs(ratio) + jnp.sqrt(1 + ratio**2))
-        tangent = jnp.where(overlap == 0, 0, tangent)
-        cosine = 1 / jnp.sqrt(1 + tangent**2)
-        a, b = cosine * (a - tangent * b), cosine * (b + tangent * a)
-        # As in a tournament: the first stays, the others move on by one place, until everyone has met everyone.
-        return jnp.concatenate([a[:, :1], b[:, :1], a[:, 1:-1], b[:, 1:], a[:, 1:][:, -1:]], axis=1)
-
-    even = jnp.pad(R, ((0, 0), (0, 2 * half - p)))
-    turned = jax.lax.fori_loop(0, SWEEPS * (2 * half - 1), rotate, even)
-    return jnp.sort(jnp.linalg.norm(turned, axis=0))[::-1][:p]
-
-
-def _inverse_of_triangle(R: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """Back substitution, written so that it vectorises over windows."""
-    p = R.shape[0]
-    unit = jnp.eye(p, dtype=R.dtype)
-
-    def add_row(k: Array, X: Array) -> Array:
-        i = p - 1 - k
-        return X.at[i].set((unit[i] - R[i] @ X) / R[i, i])
-
-    return jax.lax.fori_loop(0, p, add_row, jnp.zeros_like(R))
 
 
 def _coloured(Q: Array, rss: Array, scale: Array, noise: Array) -> tuple[Array, Array]:

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.arm import mass_matrix
-from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.models.kinematics import ArmGeometry
+from jaximp.numerics.linear_algebra import solve_pair
 from jaximp.types import AnyArray
 
 Values = TypeVar("Values")

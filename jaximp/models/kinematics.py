@@ -12,17 +12,11 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.arm import two_numbers
 from jaximp.models.joint import sine_and_cosine
+from jaximp.numerics.linear_algebra import solve_pair
 from jaximp.types import AnyArray
 
 ROUNDING = 16
 """How many roundings beyond the reach, as a share of its square, still count as a straight or a folded arm."""
-
-
-def solve_pair(matrix: Num[AnyArray, "*#N 2 2"], right: Num[AnyArray, "*#N 2"]) -> Float[Array, "*N 2"]:
-    """`x` with `matrix @ x = right`, by Cramer's rule: no LAPACK in what runs by the thousand."""
-    (a, b), (c, d) = (matrix[..., 0, 0], matrix[..., 0, 1]), (matrix[..., 1, 0], matrix[..., 1, 1])
-    first, second = right[..., 0], right[..., 1]
-    return jnp.stack([d * first - b * second, a * second - c * first], axis=-1) / (a * d - b * c)[..., None]
 
 
 class ArmGeometry(eqx.Module):

@@ -1,1 +1,1 @@
-"""Small linear algebra and the settings of the compiler, for all that follows."""
+"""What all that follows counts with: linear algebra, least squares with constraints, minimisers, the compiler."""

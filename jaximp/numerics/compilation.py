@@ -1,4 +1,7 @@
-"""How XLA compiles: `compiled` is `jax.jit` with the settings that suit this project's loops on a CPU."""
+"""How XLA compiles: `compiled` is `jax.jit` with the settings that suit this project's loops on a CPU.
+
+XLA would compute numbers again wherever they are used; `keep` makes it write them once.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -62,3 +66,11 @@ def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
             return plain(*args, **kwargs)
 
     return call
+
+
+def keep(x: Any) -> Any:
+    """Write these numbers to memory: whoever needs them must not compute them again.
+
+    Under `compiled`; otherwise the result is the same, slower.
+    """
+    return lax.optimization_barrier(x)

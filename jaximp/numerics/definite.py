@@ -1,7 +1,6 @@
 """Least squares in which symmetric matrices of two by two must be positive semidefinite, by Levenberg and Marquardt.
 
-Small enough to be done by the thousand: written for one problem without LAPACK, whose batched calls can block each
-other for ever on few cores where several programs run at a time, and `vmap`ped where it is used.
+Small enough to be done by the thousand: written for one problem without LAPACK, and `vmap`ped where it is used.
 
 Symmetric matrices are vectors `(k11, k12, k22)` here.
 """
@@ -18,7 +17,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jaximp.least_squares.engine import keep
+from jaximp.numerics.linear_algebra import back_substitute, triangle
 
 ROUNDS, STEPS = 2, 20
 """Multipliers are renewed so many times, with at most so many steps of the minimiser for each."""
@@ -33,50 +32,6 @@ SINGULAR = 1e-8
 """A matrix is singular whose smallest eigenvalue is this share of what was the largest without the constraint."""
 TIMES = np.array([1.0, 2.0, 1.0])
 """How often each number stands in the matrix."""
-
-
-def triangle(columns: Float[Array, "p N"]) -> Float[Array, "p p"]:
-    """Upper triangle R of a thin QR decomposition of p columns, by modified Gram-Schmidt.
-
-    The columns need not be independent: a pivot is then zero, or rounding. R is as accurate as Householder's, column by
-    column, whatever becomes of the Q that is not returned (Björck 1967).
-    """
-    p = len(columns)
-
-    def add_row(j: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        columns, R = state
-        square = (columns[j] ** 2).sum()
-        pivot = jnp.sqrt(jnp.where(square > 0, square, 1)) * (square > 0)
-        unit = columns[j] / jnp.where(square > 0, pivot, 1)
-        along = jnp.where(jnp.arange(p) > j, (columns * unit).sum(axis=1), 0)
-        return keep((columns - along[:, None] * unit, R.at[j].set(along.at[j].set(pivot))))
-
-    return jax.lax.fori_loop(0, p, add_row, (columns, jnp.zeros((p, p), columns.dtype)))[1]
-
-
-def cholesky(H: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Bool[Array, ""]]:
-    """Upper triangle R with `R' R = H`, and whether H is positive definite; where it is not, R is not to be used."""
-    p = len(H)
-
-    def add_row(j: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        left, R, definite = state
-        positive = left[j, j] > 0
-        row = jnp.where(jnp.arange(p) >= j, left[j], 0) / jnp.sqrt(jnp.where(positive, left[j, j], 1))
-        return keep((left - row[:, None] * row, R.at[j].set(row), definite & positive))
-
-    return jax.lax.fori_loop(0, p, add_row, (H, jnp.zeros_like(H), jnp.array(True)))[1:]
-
-
-def back_substitute(R: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
-    """`x` with `R x = right`, from the upper triangle alone; zero where a pivot is."""
-    p = len(right)
-
-    def add_row(k: Array, x: Array) -> Array:
-        i = p - 1 - k
-        pivot = R[i, i]
-        return x.at[i].set(jnp.where(pivot == 0, 0, (right[i] - (R[i] * x).sum()) / jnp.where(pivot == 0, 1, pivot)))
-
-    return jax.lax.fori_loop(0, p, add_row, jnp.zeros_like(right))
 
 
 def eigenvalues(k: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from jaximp.jobs.job import Job
 from jaximp.jobs.trials import TrialsSettings
 from jaximp.least_squares.window import confidence_interval
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.isolation import (
     METHODS,
     Impedance,
@@ -45,7 +46,6 @@ from jaximp.perturbation.stiffness import (
     fit_triangles_linear,
     residual_triangle,
 )
-from jaximp.signals.filters import require_float64
 from jaximp.trust.verdicts import (
     NO_DATA,
     POOR,

@@ -19,13 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
 
-from jaximp.design.objectives import solve_gram
 from jaximp.models.arm import PlanarArm, borner_from_lakatos, lakatos_from_borner, rigid_body_torque
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import array_field
+from jaximp.numerics.lanes import solve_definite
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Handle, Movements, cut_at_onset
 from jaximp.perturbation.output_error import output_error
-from jaximp.signals.filters import butterworth, central_differences, filter_zero_phase
+from jaximp.signals.derivatives import central_differences
+from jaximp.signals.filters import butterworth, filter_zero_phase
 from jaximp.types import AnyArray, Numbers
 
 FILTER_ORDER = 10
@@ -368,8 +369,8 @@ def static_fit(
     size = jnp.sqrt(jnp.diagonal(grams.sum(axis=0)))
     grams, moments = grams / jnp.multiply.outer(size, size), moments / size
     gram = grams.sum(axis=0)
-    theta = solve_gram(gram, moments.sum(axis=0)[:, None])[:, 0]
-    influence = solve_gram(gram, (moments - grams @ theta).T) * jnp.sqrt(len(moments) / (len(moments) - 1))
+    theta = solve_definite(gram, moments.sum(axis=0)[:, None])[:, 0]
+    influence = solve_definite(gram, (moments - grams @ theta).T) * jnp.sqrt(len(moments) / (len(moments) - 1))
     # The inertia in the order of eq. (12) is a linear function of the parameters.
     of_inertia = jax.vmap(borner_from_lakatos, 1, 1)((influence / size[:, None])[:3])
     theta = theta / size

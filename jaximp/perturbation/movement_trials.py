@@ -15,19 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp.models.kinematics import ArmGeometry
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Handle, Movements
-from jaximp.signals.filters import (
-    butterworth,
-    fill_gaps,
-    filter_zero_phase,
-    noise_level,
-    quantisation_step,
-    require_float64,
-    savitzky_golay,
-    savitzky_golay_gain,
-    savitzky_golay_half_length,
-    widen_gaps,
-)
+from jaximp.signals.derivatives import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
+from jaximp.signals.filters import butterworth, filter_zero_phase
+from jaximp.signals.samples import fill_gaps, noise_level, quantisation_step, widen_gaps
 from jaximp.types import Numbers, Recording
 
 NOISE = 6.0

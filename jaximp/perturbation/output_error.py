@@ -64,8 +64,8 @@ from jaxtyping import Array, Bool, Float, Integer, Num
 
 from jaximp.models.arm import coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
 from jaximp.models.kinematics import ArmGeometry
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Deviations, Handle, Movements
-from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers
 
 BIN = 0.005

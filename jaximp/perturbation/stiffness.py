@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 from numpy.typing import NDArray
 
-from jaximp.numerics.definite import Semidefinite, back_substitute, semidefinite_least_squares, triangle
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.definite import Semidefinite, semidefinite_least_squares
+from jaximp.numerics.linear_algebra import back_substitute, triangle
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
 FEWEST_TRIALS = 5

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
-from jaximp.design.objectives import solve_gram
 from jaximp.identification.filters import FilterSettings, design_filters
 from jaximp.identification.regression import filtered
 from jaximp.least_squares.window import WindowFit, least_squares, variance_accounted_for
 from jaximp.models.arm import PlanarArm
 from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.numerics.lanes import solve_definite
 from jaximp.perturbation.movement_trials import NOISE, check_directions, check_hand, find_onset, trial_name
 from jaximp.recordings.load import load_recording
 from jaximp.signals.filters import kept_variance
@@ -253,7 +253,7 @@ def _with_error_of_the_baseline(fit: WindowFit, rows: TrialRows, counted: Array)
     parameters inherit it through the sum of what each sample contributes to them."""
     W = jnp.where(counted[..., None, None], rows.W, 0)
     p = W.shape[-1]
-    passed_on = solve_gram(jnp.einsum("tnap,tnaq->pq", W, W), W.sum(axis=1).reshape(-1, p).T)
+    passed_on = solve_definite(jnp.einsum("tnap,tnaq->pq", W, W), W.sum(axis=1).reshape(-1, p).T)
     rows_left = fit.samples - p
     white = fit.residual_rms**2 * fit.samples / jnp.where(rows_left > 0, rows_left, jnp.nan) / rows.kept
     covariance = fit.covariance + white / rows.baseline * passed_on @ passed_on.T

@@ -22,11 +22,12 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Num, Shaped
 
 from jaximp.least_squares.noise import WhiteRows, triangles
-from jaximp.numerics.definite import back_substitute, cholesky, eigenvalues, triangle
+from jaximp.numerics.definite import eigenvalues
+from jaximp.numerics.linear_algebra import back_substitute, cholesky, triangle
+from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.stiffness import ELEMENTS, FEWEST_TRIALS, SEVEN, element_columns
 from jaximp.posterior.predictive import NU, student
 from jaximp.posterior.priors import Prior, make_prior
-from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers
 
 FLAT = 1e-12

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
-from jaximp.signals.filters import require_float64
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers, nearest
 
 RHAT_MOST = 1.05
@@ -437,7 +437,7 @@ def exact_posterior(
 
 @eqx.filter_jit
 def _draw_exact(posterior: ExactPosterior, key: PRNGKeyArray, n: int) -> Array:
-    from jaximp.numerics.definite import back_substitute
+    from jaximp.numerics.linear_algebra import back_substitute
 
     normal_key, chi_key = jax.random.split(key)
     dof, scale = jnp.asarray(posterior.dof), jnp.asarray(posterior.scale)

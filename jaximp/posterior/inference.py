@@ -36,6 +36,7 @@ from jaximp.least_squares.noise import (
 )
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
+from jaximp.numerics.precision import require_float64
 from jaximp.posterior.densities import (
     Density,
     linear_density,
@@ -47,7 +48,6 @@ from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_poste
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
-from jaximp.signals.filters import require_float64
 from jaximp.trust.verdicts import TRUSTED, Verdicts
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 

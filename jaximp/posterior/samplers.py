@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Num, PRNGKeyArray
 from numpy.typing import NDArray
 
+from jaximp.numerics.precision import require_float64
 from jaximp.posterior.draws import (
     ESS_LEAST,
     RHAT_MOST,
@@ -29,7 +30,6 @@ from jaximp.posterior.draws import (
     make_posterior,
 )
 from jaximp.posterior.files import Chain, resume_chain, write_chain
-from jaximp.signals.filters import require_float64
 from jaximp.types import AnyArray, Numbers, Progress
 
 WALKERS = 32

@@ -1,7 +1,7 @@
-"""Filters and derivatives of sampled signals; time is axis 0.
+"""Butterworth filters forward and backward: of a whole signal, of one with padding, inside every window.
 
 scipy designs the filters. Applying them is written here in JAX, with scipy's edge treatment, differentiable and
-vmappable. What many windows of one recording share (`CutSignal`) is worked out in numpy.
+vmappable. What many windows of one recording share (`CutSignal`) is worked out in numpy. Time is axis 0.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Integer, Num
 from numpy.typing import NDArray
 
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
 Sections = NDArray[np.float64] | tuple[tuple[float, ...], ...]
@@ -25,17 +26,6 @@ BLOCK = 64
 """Samples that a filter takes in one product."""
 SLOW = 5.0
 """Sample rate at which nobody records a motion [Hz]: milliseconds that were read as seconds."""
-
-
-def require_float64(*arrays: object) -> None:
-    """Raise where float64 numbers would silently become float32; without arrays, wherever float64 is off."""
-    if jax.config.read("jax_enable_x64"):
-        return
-    if not arrays or any(np.dtype(getattr(array, "dtype", np.float64)) != np.float32 for array in arrays):
-        raise ValueError(
-            "float64 is off, and identification needs it: call jax.config.update('jax_enable_x64', True) before "
-            "the first computation (or pass float32 arrays if you mean it)"
-        )
 
 
 def butterworth(order: int, cutoff: float, sample_rate: float, kind: str = "lowpass") -> NDArray[np.float64]:
@@ -311,125 +301,6 @@ def zero_phase_matrix(sos: Sections, n: int, every: int = 1) -> NDArray[np.float
     return filter_in_windows(sos, cut_signal(impulse, np.arange(n)[::-1], n)).at(np.arange(0, n, every)).T
 
 
-def central_differences(
-    q: Num[AnyArray, "N *k"], sample_rate: float | Float[AnyArray, ""]
-) -> tuple[Float[AnyArray, "N *k"], Float[AnyArray, "N *k"]]:
-    """First and second derivative by central differences; the first and last sample take one-sided ones.
-
-    Those of a numpy array are numpy arrays.
-    """
-    concatenate = np.concatenate if isinstance(q, np.ndarray) else jnp.concatenate
-    if q.shape[0] < 3:
-        raise ValueError(f"{q.shape[0]} samples have no second difference: at least 3 are needed")
-    dq = (q[2:] - q[:-2]) * (sample_rate / 2)
-    first = (-3 * q[:1] + 4 * q[1:2] - q[2:3]) * (sample_rate / 2)
-    last = (3 * q[-1:] - 4 * q[-2:-1] + q[-3:-2]) * (sample_rate / 2)
-    ddq = (q[2:] - 2 * q[1:-1] + q[:-2]) * sample_rate**2
-    return concatenate([first, dq, last]), concatenate([ddq[:1], ddq, ddq[-1:]])
-
-
-def central_differences_padded(
-    q: Num[AnyArray, "N k"], sample_rate: Float[AnyArray, ""], n: Int[AnyArray, ""]
-) -> tuple[Float[Array, "N k"], Float[Array, "N k"]]:
-    """`central_differences` of the first n samples; what stands behind them means nothing, before and after."""
-    dq, ddq = central_differences(q, sample_rate)
-    end = central_differences(lax.dynamic_slice_in_dim(q, n - 3, 3), sample_rate)
-    at_end = (jnp.arange(q.shape[0]) == n - 1)[:, None]
-    return jnp.where(at_end, end[0][-1:], dq), jnp.where(at_end, end[1][-1:], ddq)
-
-
-def savitzky_golay_half_length(sample_rate: float, cutoff: float = 50.0, order: int = 7) -> int:
-    """Half length M of the Savitzky-Golay filter (2 M + 1 samples) with this `cutoff` [Hz].
-
-    From `f_c = (n + 1) / (3.2 M - 4.6)`, with the order n of the polynomial and f_c in halves of the sample rate. With
-    order 7 and 50 Hz, the velocity is down by 3 dB at 50 Hz, the position at 46 Hz (its order is in fact 6: odd powers
-    vanish in the middle), and the acceleration at 41 Hz.
-
-    **Raises:** `ValueError` for a cut-off that would take no more samples than the polynomial has coefficients.
-
-    **Source:** Schafer 2011 (IEEE Signal Processing Magazine 28(4)), a fit that holds for M of at least 25.
-    """
-    if not 0 < cutoff < sample_rate / 2:
-        raise ValueError(f"the cut-off of {cutoff:g} Hz must lie between 0 and {sample_rate / 2:g} Hz, half the rate")
-    half = round(((order + 1) * sample_rate / (2 * cutoff) + 4.6) / 3.2)
-    if 2 * half <= order:
-        raise ValueError(
-            f"a cut-off of {cutoff:g} Hz at {sample_rate:g} Hz leaves {2 * half + 1} samples for a polynomial of order "
-            f"{order}: lower one of them"
-        )
-    return half
-
-
-def savitzky_golay(
-    x: Num[AnyArray, "N *k"], sample_rate: float, derivative: int = 0, cutoff: float = 50.0, order: int = 7
-) -> Float[AnyArray, "N *k"]:
-    """A derivative of a sampled signal, of polynomials that are fitted around every sample; `derivative=0` smooths.
-
-    At both ends the polynomial of the first or last whole window is evaluated off its middle, which passes much noise:
-    leave out `savitzky_golay_half_length` samples there, and around gaps.
-
-    The numbers are those of `scipy.signal.savgol_filter`, which cannot be used here: it fits powers of the sample's
-    index, and with order 7 and 203 samples (50 Hz at 4 kHz) its least squares cuts off the highest of them.
-
-    **Raises:** `ValueError` if the signal is shorter than the filter, and as `savitzky_golay_half_length`.
-
-    **Source:** Savitzky and Golay 1964; order and cut-off as in Börner et al. 2020, 2.4.1.
-    """
-    from scipy.signal import oaconvolve
-
-    x = np.asarray(x, np.float64)
-    half = savitzky_golay_half_length(sample_rate, cutoff, order)
-    if len(x) < 2 * half + 1:
-        raise ValueError(f"{len(x)} samples are too few for this filter, which has {2 * half + 1}: record longer")
-    weights = _polynomial_weights(half, order, derivative) * (sample_rate / half) ** derivative
-    columns = x.reshape(len(x), -1)
-    shift = columns[:1] if derivative else 0.0  # a large constant would cost digits
-    middle = oaconvolve(columns - shift, weights[half][::-1, None], mode="valid", axes=0)
-    start, end = (weights[part] @ (ends - shift) for part, ends in (
-        (slice(None, half), columns[: 2 * half + 1]), (slice(half + 1, None), columns[-2 * half - 1 :])
-    ))  # fmt: skip
-    return np.concatenate([start, middle, end]).reshape(x.shape)
-
-
-def savitzky_golay_gain(sample_rate: float, derivative: int, cutoff: float = 50.0, order: int = 7) -> float:
-    """Standard deviation that `savitzky_golay` makes of white noise of unit standard deviation, away from the ends."""
-    half = savitzky_golay_half_length(sample_rate, cutoff, order)
-    weights = _polynomial_weights(half, order, derivative)[half]
-    return float(np.linalg.norm(weights) * (sample_rate / half) ** derivative)
-
-
-@lru_cache(maxsize=32)
-def _polynomial_weights(half: int, order: int, derivative: int) -> NDArray[np.float64]:
-    """(2 half + 1, 2 half + 1) from samples at -1 to 1 to the derivative there of the polynomial that fits them all."""
-    from numpy.polynomial import legendre
-
-    # Legendre polynomials are almost orthogonal over the samples; powers are far from it.
-    t = np.linspace(-1, 1, 2 * half + 1)
-    basis, unit = legendre.legvander(t, order), np.eye(order + 1)
-    derived = np.stack([legendre.legval(t, legendre.legder(row, derivative)) for row in unit], axis=1)
-    return np.asarray(derived @ np.linalg.pinv(basis))
-
-
-def differences_in_windows(signal: CutSignal, sample_rate: float) -> tuple[CutSignal, CutSignal]:
-    """`central_differences` of every window by itself."""
-    starts, x, shapes, amounts = signal
-    window = shapes.shape[1]
-    of_shapes = central_differences(shapes.T, sample_rate)
-    three = np.arange(3)[:, None]
-    first, last = starts, starts + window - 1
-    one_sided = [central_differences(x[start + three], sample_rate) for start in (first, last - 2)]
-    results = []
-    for k, whole in enumerate(central_differences(x, sample_rate)):
-        ends = np.stack([one_sided[0][k][0] - whole[first], one_sided[1][k][-1] - whole[last]], axis=-1)
-        at_ends = np.eye(window)[[0, -1]]
-        results.append(
-            CutSignal(
-                starts, whole, np.concatenate([at_ends, of_shapes[k].T]), np.concatenate([ends, amounts], axis=-1)
-            )
-        )
-    return results[0], results[1]
-
-
 def autocovariance(sos: Sections, every: int = 1, tolerance: float = 1e-9) -> NDArray[np.float64]:
     """Autocovariance of white noise that was filtered to zero phase and then kept every n-th sample, as (L,).
 
@@ -471,109 +342,8 @@ def _zero_phase_gain(sos: Sections) -> NDArray[np.float64]:
     return np.abs(freqz_sos(sos, worN=np.linspace(0, np.pi, n // 2 + 1))[1]) ** 2
 
 
-def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Straight lines across the samples that are not valid, so that a filter can pass; (N, k) or (N,)."""
-    if valid.all():
-        return x
-    index = np.arange(len(x))
-    columns = x.reshape(len(x), -1)
-    filled = np.stack([np.interp(index, index[valid], column[valid]) for column in columns.T], axis=1)
-    return filled.reshape(x.shape)
+def __getattr__(name: str) -> object:
+    """Names that stood here before; to go as soon as nobody asks for them."""
+    from jaximp import signals
 
-
-def long_gaps(valid: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """True in the gaps of more than `longest` samples, and in those at the ends."""
-    out = ~valid
-    if not out.any():
-        return out
-    edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(np.int8)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first <= longest and first > 0 and last < len(valid):
-            out[first:last] = False
-    return out
-
-
-def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[np.bool_]:
-    """Also invalidate `by` samples on both sides of every gap, and at both ends: where a filter saw no measurement."""
-    if valid.all():
-        inside = np.ones(len(valid), bool)
-        if ends:
-            inside[:by] = inside[max(0, len(valid) - by) :] = False
-        return inside
-    gone = np.cumsum(np.r_[np.zeros(by + 1), ends, ~valid, ends, np.zeros(by)])
-    near = gone[2 * by + 1 :] - gone[: -2 * by - 1]
-    return np.asarray(near == 0)[1:-1]
-
-
-def lengthen_gaps(valid: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Also invalidate `by` samples after every gap: where a memory reaches back into it."""
-    if by == 0:
-        return valid.copy()
-    gone = np.cumsum(np.r_[np.zeros(by + 1), ~valid])
-    return np.asarray(gone[by + 1 :] == gone[: len(valid)])
-
-
-def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool_]:
-    """Where a signal (N,) leaps between two samples as no joint can move; both samples are True.
-
-    A leap is a difference that exceeds six times all those nearby and twenty times the noise: a recorder that was
-    switched, an encoder that lost counts, a trial that was cut. A filter would ring there, and the ringing would pass
-    for an excitation that the torque never saw. `noise` is the `noise_level`, where it is known.
-    """
-    from scipy.ndimage import maximum_filter1d
-
-    size = np.abs(np.diff(x))
-    size = np.where(np.isfinite(size), size, 0.0)
-    leap = size > 20 * (noise_level(x) if noise is None else noise)
-    if not leap.any():
-        return np.zeros(len(x), bool)
-    nearby = maximum_filter1d(np.pad(size, 6), 5)
-    before, after = (nearby[6 + shift : 6 + shift + len(size)] for shift in (-3, 3))
-    leap &= size > 6 * np.maximum(before, after)
-    return np.r_[leap, False] | np.r_[False, leap]
-
-
-def noise_level(x: NDArray[np.float64]) -> float:
-    """Standard deviation of the white noise in a smooth, finely sampled signal (N,), from its fourth differences.
-
-    A motion that is slow against the sample rate vanishes in them. The median keeps jumps from counting. A coarse
-    encoder leaves at least the noise of its rounding, step/sqrt(12).
-    """
-    fourth = np.diff(x, 4)
-    fourth = fourth[np.isfinite(fourth)]
-    if not len(fourth):
-        return 0.0
-    robust = 1.4826 * np.median(np.abs(fourth)) / np.sqrt(70.0)
-    return float(max(robust, quantisation_step(x) / np.sqrt(12.0)))
-
-
-def quantisation_step(x: NDArray[np.float64]) -> float:
-    """Step of the encoder or converter that made a signal (N,), or zero where none can be seen.
-
-    The step is the smallest difference between distinct values, provided that all differences are whole multiples of
-    it and values repeat often; a finely resolved signal has no such step.
-    """
-    known = x[np.isfinite(x)]
-    # If N samples take N / 2 values, about a hundred pairs among 10 sqrt(N) of them are equal: without any, no step.
-    some = _some(len(known))
-    if len(_distinct(known[some])) == len(some):
-        return 0.0
-    values = _distinct(known)
-    if len(values) < 3 or len(x) < 2 * len(values):
-        return 0.0
-    gaps = np.diff(values)
-    multiples = gaps / gaps.min()
-    fits = np.abs(multiples - np.round(multiples)) < 0.05
-    return float(np.median((gaps / np.round(multiples))[fits])) if fits.mean() > 0.9 else 0.0
-
-
-@lru_cache(maxsize=32)
-def _some(count: int) -> NDArray[np.int64]:
-    """About 10 sqrt(N) of so many indices, drawn once."""
-    return np.unique(np.random.default_rng(0).integers(max(count, 1), size=int(10 * count**0.5)))
-
-
-def _distinct(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rising values; sums of steps differ in their last digits, and are one value."""
-    values = np.sort(x)
-    return values[np.diff(values, prepend=-np.inf) > 1e-9 * np.abs(values[[0, -1]]).max()] if len(values) else values
+    return getattr(signals, name)

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 
 from jaximp.models.arm import mass_matrix, rigid_body_torque
-from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import MinimumJerk, array_field
+from jaximp.numerics.linear_algebra import solve_pair
 from jaximp.types import AnyArray
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, -1], [-1, 1]]) * 0.05

@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
 from jaximp.models.arm import coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
-from jaximp.models.kinematics import ArmGeometry, solve_pair
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import MinimumJerk, RaisedSine, array_field
+from jaximp.numerics.linear_algebra import solve_pair
 from jaximp.perturbation.movements import VOLUNTARY_DELAY, Handle, Movements
 from jaximp.signals.filters import butterworth, filter_from_zero
 from jaximp.types import AnyArray

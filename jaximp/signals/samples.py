@@ -1,0 +1,116 @@
+"""What raw samples are like: gaps, jumps, noise, the step of the encoder. Plain numpy, before anything is filtered."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Straight lines across the samples that are not valid, so that a filter can pass; (N, k) or (N,)."""
+    if valid.all():
+        return x
+    index = np.arange(len(x))
+    columns = x.reshape(len(x), -1)
+    filled = np.stack([np.interp(index, index[valid], column[valid]) for column in columns.T], axis=1)
+    return filled.reshape(x.shape)
+
+
+def long_gaps(valid: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """True in the gaps of more than `longest` samples, and in those at the ends."""
+    out = ~valid
+    if not out.any():
+        return out
+    edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(np.int8)))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first <= longest and first > 0 and last < len(valid):
+            out[first:last] = False
+    return out
+
+
+def widen_gaps(valid: NDArray[np.bool_], by: int, ends: bool = True) -> NDArray[np.bool_]:
+    """Also invalidate `by` samples on both sides of every gap, and at both ends: where a filter saw no measurement."""
+    if valid.all():
+        inside = np.ones(len(valid), bool)
+        if ends:
+            inside[:by] = inside[max(0, len(valid) - by) :] = False
+        return inside
+    gone = np.cumsum(np.r_[np.zeros(by + 1), ends, ~valid, ends, np.zeros(by)])
+    near = gone[2 * by + 1 :] - gone[: -2 * by - 1]
+    return np.asarray(near == 0)[1:-1]
+
+
+def lengthen_gaps(valid: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """Also invalidate `by` samples after every gap: where a memory reaches back into it."""
+    if by == 0:
+        return valid.copy()
+    gone = np.cumsum(np.r_[np.zeros(by + 1), ~valid])
+    return np.asarray(gone[by + 1 :] == gone[: len(valid)])
+
+
+def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool_]:
+    """Where a signal (N,) leaps between two samples as no joint can move; both samples are True.
+
+    A leap is a difference that exceeds six times all those nearby and twenty times the noise: a recorder that was
+    switched, an encoder that lost counts, a trial that was cut. A filter would ring there, and the ringing would pass
+    for an excitation that the torque never saw. `noise` is the `noise_level`, where it is known.
+    """
+    from scipy.ndimage import maximum_filter1d
+
+    size = np.abs(np.diff(x))
+    size = np.where(np.isfinite(size), size, 0.0)
+    leap = size > 20 * (noise_level(x) if noise is None else noise)
+    if not leap.any():
+        return np.zeros(len(x), bool)
+    nearby = maximum_filter1d(np.pad(size, 6), 5)
+    before, after = (nearby[6 + shift : 6 + shift + len(size)] for shift in (-3, 3))
+    leap &= size > 6 * np.maximum(before, after)
+    return np.r_[leap, False] | np.r_[False, leap]
+
+
+def noise_level(x: NDArray[np.float64]) -> float:
+    """Standard deviation of the white noise in a smooth, finely sampled signal (N,), from its fourth differences.
+
+    A motion that is slow against the sample rate vanishes in them. The median keeps jumps from counting. A coarse
+    encoder leaves at least the noise of its rounding, step/sqrt(12).
+    """
+    fourth = np.diff(x, 4)
+    fourth = fourth[np.isfinite(fourth)]
+    if not len(fourth):
+        return 0.0
+    robust = 1.4826 * np.median(np.abs(fourth)) / np.sqrt(70.0)
+    return float(max(robust, quantisation_step(x) / np.sqrt(12.0)))
+
+
+def quantisation_step(x: NDArray[np.float64]) -> float:
+    """Step of the encoder or converter that made a signal (N,), or zero where none can be seen.
+
+    The step is the smallest difference between distinct values, provided that all differences are whole multiples of
+    it and values repeat often; a finely resolved signal has no such step.
+    """
+    known = x[np.isfinite(x)]
+    # If N samples take N / 2 values, about a hundred pairs among 10 sqrt(N) of them are equal: without any, no step.
+    some = _some(len(known))
+    if len(_distinct(known[some])) == len(some):
+        return 0.0
+    values = _distinct(known)
+    if len(values) < 3 or len(x) < 2 * len(values):
+        return 0.0
+    gaps = np.diff(values)
+    multiples = gaps / gaps.min()
+    fits = np.abs(multiples - np.round(multiples)) < 0.05
+    return float(np.median((gaps / np.round(multiples))[fits])) if fits.mean() > 0.9 else 0.0
+
+
+@lru_cache(maxsize=32)
+def _some(count: int) -> NDArray[np.int64]:
+    """About 10 sqrt(N) of so many indices, drawn once."""
+    return np.unique(np.random.default_rng(0).integers(max(count, 1), size=int(10 * count**0.5)))
+
+
+def _distinct(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rising values; sums of steps differ in their last digits, and are one value."""
+    values = np.sort(x)
+    return values[np.diff(values, prepend=-np.inf) > 1e-9 * np.abs(values[[0, -1]]).max()] if len(values) else values
