@@ -15,7 +15,7 @@ from jaximp import identify_recording, parse_job, recording_from_arrays
 from jaximp.cli.main import app
 from jaximp.design.files import read_trajectory
 from jaximp.jobs.design import parse_design_job, read_design_job
-from jaximp.trust.verdicts import fake_change_threshold
+from jaximp.trust.criteria import fake_change_threshold
 
 JOB = """
 [model]

@@ -23,7 +23,8 @@ from jaximp.perturbation.impedance import ArmImpedance, at_other_windows, identi
 from jaximp.perturbation.isolation import METHODS, Deviations, Impedance, Isolated, JointDeviations, KnownArm, Method
 from jaximp.perturbation.movement_trials import handle_disagreement
 from jaximp.perturbation.movements import Handle, Movements
-from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK, TrustLimits
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK
 
 NASTY = "<script>alert(1).csv"
 FIGURES = {"deviations", "spectra", "torques", "ellipses", "windows", "methods"}

@@ -25,7 +25,8 @@ from jaximp.perturbation.trials import (
     regress_trials,
 )
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
-from jaximp.trust.verdicts import TrustLimits, confidence
+from jaximp.trust.criteria import confidence
+from jaximp.trust.limits import TrustLimits
 from jaximp.types import Recording
 
 RATE = 1000.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -14,18 +14,12 @@ from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import SlidingFit, sliding_least_squares
+from jaximp.models.base import Role
 from jaximp.recordings.load import recording_from_arrays
-from jaximp.trust.verdicts import (
-    FAKE,
-    NO_DATA,
-    POOR,
-    TRUSTED,
-    VERDICTS,
-    WEAK,
-    TrustLimits,
-    fake_change_threshold,
-    judge,
-)
+from jaximp.trust.criteria import fake_change_threshold
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK
+from jaximp.trust.windows import RULES, judge_windows, measure_windows
 
 Numbers = NDArray[np.float64]
 
@@ -170,6 +164,7 @@ def test_every_window_that_is_not_trusted_has_a_reason(decimate: int | None) -> 
 # ---- Which rule comes first.
 
 NAMES = ("inertia", "stiffness")
+ROLES = (Role("inertia"), Role("stiffness"))
 SAMPLES = 100
 
 
@@ -235,15 +230,10 @@ CASES = [
 
 
 def verdict_of(changes: dict[str, object], threshold: float | None = 20.0, **limits: object) -> tuple[str, str]:
-    verdicts = judge(
-        sliding(Window(), Window(**changes)),  # type: ignore[arg-type]
-        NAMES,
-        SAMPLES,
-        np.zeros(2),
-        np.full(2, 0.1),
-        threshold,
-        TrustLimits(**limits),  # type: ignore[arg-type]
-    )
+    chosen = TrustLimits(**limits)  # type: ignore[arg-type]
+    fit = sliding(Window(), Window(**changes))  # type: ignore[arg-type]
+    measured = measure_windows(fit, NAMES, ROLES, SAMPLES, np.zeros(2), np.full(2, 0.1), threshold, chosen)
+    verdicts = judge_windows(measured, chosen)
     assert (verdicts.verdict[0], verdicts.reason[0]) == (TRUSTED, "")
     return str(verdicts.verdict[1]), str(verdicts.reason[1])
 
@@ -281,7 +271,7 @@ def test_a_parameter_near_zero_is_measured_against_what_would_matter() -> None:
     """A damping of zero within a small error is a result, not a weak excitation."""
     fit = sliding(Window(theta=(1e-9, 20.0), stderr=(1e-3, 0.2)))
     for scale, verdict in ((0.0, WEAK), (0.1, TRUSTED)):
-        judged = judge(fit, NAMES, SAMPLES, np.array([scale, 0.0]), np.zeros(2))
+        judged = judge_windows(measure_windows(fit, NAMES, ROLES, SAMPLES, np.array([scale, 0.0]), np.zeros(2)))
         assert judged.verdict.tolist() == [verdict]
 
 
@@ -310,5 +300,20 @@ def test_windows_with_hardly_more_samples_than_parameters_are_not_trusted() -> N
     random = np.random.default_rng(4)
     W = random.normal(size=(200, 3))
     fit = sliding_least_squares(W, W @ [1.0, 2.0, 3.0] + 0.01 * random.normal(size=200), 5)
-    verdicts = judge(fit, ("a", "b", "c"), 5, np.ones(3), np.zeros(3))
+    others = (Role("other"),) * 3
+    verdicts = judge_windows(measure_windows(fit, ("a", "b", "c"), others, 5, np.ones(3), np.zeros(3)))
     assert not verdicts.trusted.any()
+
+
+def test_nothing_is_trusted_that_was_not_judged() -> None:
+    """Who builds estimates gives what was measured; the verdict is no argument."""
+    assert not [field.name for field in fields(Estimates) if "verdict" in field.name or "trust" in field.name]
+    judged = identified(MULTISINE, False)
+    hopeless = replace(judged.limits, min_vaf=1.1)
+    assert judged.verdicts.trusted.any()
+    assert not replace(judged, limits=hopeless).verdicts.trusted.any()
+
+
+def test_every_rule_has_a_name_of_its_own_and_a_known_label() -> None:
+    assert len({rule.name for rule in RULES}) == len(RULES)
+    assert {rule.label for rule in RULES} <= set(VERDICTS) - {TRUSTED}

@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -32,14 +32,14 @@ from jaximp.identification.identify import Prepared, in_windows, prepare, share_
 from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.windows import LAGS_GRAIN
 from jaximp.jobs.job import Job
-from jaximp.least_squares.window import SlidingFit, confidence_interval
+from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
 from jaximp.recordings.load import recording_from_mapping
 from jaximp.recordings.readers import MATRICES, RecordingError, UnavailableError, count_samples
 from jaximp.reports.estimates import estimates_table
 from jaximp.reports.pages import table_of, versions
-from jaximp.trust.verdicts import VERDICTS, Verdicts
+from jaximp.trust.verdicts import VERDICTS
 from jaximp.types import Recording
 
 UNFINISHED = ".unfinished"
@@ -439,7 +439,7 @@ def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table
     about = results[0].about
     assert about is not None
     human = job.models(about.joints, about.sample_rate)[1]
-    table = estimates_table(_one_after_another(several), human, job)
+    table = estimates_table(several, human, job)
     table = table.rename_columns({"condition": "condition_number"})
     which = pa.array(np.repeat(np.arange(len(results)), [len(one.start) for one in several]))
     metadata = [dict(result.item.metadata) for result in results]
@@ -449,32 +449,6 @@ def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table
         field = pa.field(name, pa.string(), metadata={"unit": ""})
         table = table.add_column(place, field, _texts(texts).take(which))
     return table
-
-
-def _one_after_another(several: Sequence[Estimates]) -> Estimates:
-    """The windows of several recordings as if of one; curves are left out."""
-
-    def joined(arrays: Sequence[Any]) -> Any:
-        return np.concatenate([np.asarray(array) for array in arrays])
-
-    fit = {one.name: joined([getattr(e.fit, one.name) for e in several]) for one in fields(SlidingFit)}
-    return replace(
-        several[0],
-        start=joined([e.start for e in several]),
-        end=joined([e.end for e in several]),
-        fit=SlidingFit(**fit),
-        held_out_vaf=joined([e.held_out_vaf for e in several]),
-        verdicts=Verdicts(joined([e.verdicts.verdict for e in several]), joined([e.verdicts.reason for e in several])),
-        reflexes=tuple(
-            replace(
-                reflex,
-                gain=joined([e.reflexes[k].gain for e in several]),
-                gain_stderr=joined([e.reflexes[k].gain_stderr for e in several]),
-                delay=joined([e.reflexes[k].delay for e in several]),
-            )
-            for k, reflex in enumerate(several[0].reflexes)
-        ),
-    )
 
 
 def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:

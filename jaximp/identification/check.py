@@ -14,7 +14,8 @@ from jaximp.identification.identify import estimate, jump_note
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine
-from jaximp.trust.verdicts import NEGATIVE, NO_DATA, WEAK
+from jaximp.trust.verdicts import NO_DATA, WEAK
+from jaximp.trust.windows import POSITIVE_INERTIA
 from jaximp.types import Progress, Recording
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
@@ -230,7 +231,7 @@ def _window(
         verdict = estimates.verdicts.verdict
         with_data = verdict != NO_DATA
         share = float((verdict[with_data] != WEAK).mean()) if with_data.any() else 0.0
-        signs.append(np.char.find(estimates.verdicts.reason[with_data], NEGATIVE) >= 0)
+        signs.append(estimates.verdicts.rule[with_data] == POSITIVE_INERTIA)
         seen.append(f"{length:g} s {share:.0%}")
         if share >= 0.9:
             good[length] = float(np.nanmean(estimates.held_out_vaf[with_data]))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.least_squares.window import SlidingFit, WindowFit
-from jaximp.trust.verdicts import Verdicts
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import Verdicts, worst
+from jaximp.trust.windows import Windows, judge_windows
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,9 @@ class Estimates:
     """Parameters, standard errors and condition of every window."""
     held_out_vaf: NDArray[np.float64]
     """(M,) how well each window's parameters predict the torque of the window after it."""
-    verdicts: Verdicts
+    measured: tuple[Windows, ...]
+    """What the rules look at, of every joint that is judged by itself."""
+    limits: TrustLimits
     threshold: float | None
     """Threshold on the condition number, eq. (16), where a reference trajectory was given."""
     time: NDArray[np.float64]
@@ -69,6 +74,12 @@ class Estimates:
     """What a reader must know of these numbers, in plain words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
+
+    @cached_property
+    def verdicts(self) -> Verdicts:
+        """Made by the rules (`trust.windows.RULES`), and by nothing else; a window is as good as its worst joint."""
+        each = [judge_windows(windows, self.limits) for windows in self.measured]
+        return each[0] if len(each) == 1 else worst(each, [f"joint {j + 1}: " for j in range(len(each))])
 
     @property
     def intrinsic(self) -> NDArray[np.int64]:

@@ -32,7 +32,8 @@ from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.reflex import pathway_of, with_gain
-from jaximp.trust.verdicts import fake_change_threshold, judge, worst
+from jaximp.trust.criteria import fake_change_threshold
+from jaximp.trust.windows import measure_windows
 from jaximp.types import Progress, Recording, nearest
 
 CLEAR = 2.0
@@ -297,7 +298,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         units=model.units,
         fit=fit,
         held_out_vaf=np.min([part.held_out_vaf for part in parts], axis=0),
-        verdicts=worst([part.verdicts for part in parts], [f"joint {j + 1}: " for j in range(len(parts))]),
+        measured=tuple(windows for part in parts for windows in part.measured),
         threshold=max(thresholds, default=None),
         torque=np.concatenate([part.torque for part in parts], axis=1),
         reconstructed=np.concatenate([part.reconstructed for part in parts], axis=1),
@@ -421,19 +422,14 @@ def _estimates(
     if reflexes and not limits.parameters:
         # Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one.
         limits = replace(limits, parameters=tuple(np.delete(model.names, reflexes[0].columns).tolist()))
-    verdicts = judge(
-        fit,
-        model.names,
-        place.counted * model.n_joints,
-        whole.parameter_scale,
-        prepared.column_noise,
-        threshold,
-        limits,
+    full = place.counted * model.n_joints
+    measured = measure_windows(
+        fit, model.names, model.roles, full, whole.parameter_scale, prepared.column_noise, threshold, limits
     )
     jumps = jump_note(recording, prepared.jumps)
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
-    measured = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
-    return Estimates(
+    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
+    estimates = Estimates(
         names=model.names,
         units=model.units,
         window=pipeline.window.length,
@@ -441,19 +437,21 @@ def _estimates(
         end=rows.time[np.asarray(fit.last)],
         fit=fit,
         held_out_vaf=np.asarray(held_out),
-        verdicts=verdicts,
+        measured=(measured,),
+        limits=pipeline.limits,
         threshold=threshold,
         time=rows.time[shown],
-        torque=measured.reshape(reconstructed.shape),
+        torque=torque.reshape(reconstructed.shape),
         reconstructed=reconstructed,
         predicted=predicted,
         notes=(
             *recording.notes,
             *filter(None, (jumps, _literal_note(pipeline), why_not, *notes)),
-            *(_reflex_note(reflex, verdicts.trusted) for reflex in reflexes),
         ),
         reflexes=reflexes,
     )
+    about = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
+    return replace(estimates, notes=estimates.notes + about) if about else estimates
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

@@ -13,7 +13,7 @@ from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
-from jaximp.trust.verdicts import TrustLimits
+from jaximp.trust.limits import TrustLimits
 from jaximp.types import AnyArray, Recording
 
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str

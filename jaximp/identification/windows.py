@@ -257,7 +257,7 @@ def _finished(rows: Rows, noise: AnyArray | None, found: Any, place: Placement, 
     complete = starts + 2 * place.window <= len(rows.time)
     vaf = np.where(complete & np.isfinite(fit.theta).all(axis=1), unseen.vaf, np.nan)
     for k in doubtful[np.isfinite(vaf[doubtful])]:
-        vaf[k] = _predicted(rows, fit.theta[k], starts[k] + place.window, place.window)
+        vaf[k] = _predicted(rows, fit.theta[k], int(starts[k]) + place.window, place.window)
     return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[2])
 
 

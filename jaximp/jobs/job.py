@@ -27,7 +27,7 @@ from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping
-from jaximp.trust.verdicts import TrustLimits
+from jaximp.trust.limits import TrustLimits
 from jaximp.types import Recording
 
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from jaximp.models.base import Model
+from jaximp.models.base import Model, Role
 from jaximp.models.joint import parameter_units, sine_and_cosine
 from jaximp.types import AnyArray
 
@@ -106,6 +106,10 @@ class PlanarArm(Model):
         self.label = "arm"
         self.n_joints = 2
         self.width = None
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        return tuple(_role(name) for name in self.names)
 
     def at(self, equilibrium: Num[AnyArray, "2"]) -> PlanarArm:
         """The same arm with the elastic torque vanishing elsewhere [rad]; under `vmap`, a posture for every trial. (The
@@ -273,6 +277,19 @@ def _equilibrium(equilibrium: Sequence[float] | AnyArray | None, impedance: bool
     if max(abs(angle) for angle in angles) > 2 * np.pi:
         raise ValueError(f"equilibrium is {angles}: these are radians, and more than a turn; were degrees meant?")
     return angles
+
+
+def _role(name: str) -> Role:
+    """Of an arm's parameter, whose name ends in its indices."""
+    thing, _, index = name.rpartition("_")
+    kinds = {
+        "inertia": "base_inertia",
+        "damping": "damping",
+        "stiffness": "stiffness",
+        "viscous_friction": "friction",
+        "coulomb_friction": "friction",
+    }
+    return Role(kinds.get(thing, "other"), tuple(map(int, index)))
 
 
 # What the columns are made of, by parameter. A column that only joint i feels is called as in `Joints`, so that those

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +12,15 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 MOTION = ("q", "dq", "ddq", "1")
 """Columns of one joint that are linear in its motion: position, velocity, acceleration, and a constant one."""
+
+
+class Role(NamedTuple):
+    """What a parameter is, so that nobody must read it from a name."""
+
+    kind: str
+    """`inertia`, `base_inertia` (of an arm, in Lakatos's order), `damping`, `stiffness`, `friction`, or `other`."""
+    element: tuple[int, ...] = ()
+    """Which of several: the joint, or row and column of a matrix."""
 
 
 class Model(eqx.Module):
@@ -31,6 +41,11 @@ class Model(eqx.Module):
     """What goes in front of the names when models are stacked, such as `robot`."""
     n_joints: int = eqx.field(static=True)
     """How many joints the regressor has rows for."""
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        """What each parameter is."""
+        return tuple(Role("other") for _ in self.names)
 
     @property
     def memory(self) -> int:
@@ -150,6 +165,10 @@ class Stacked(Model):
         self.n_joints = first.n_joints
 
     @property
+    def roles(self) -> tuple[Role, ...]:
+        return self.first.roles + self.second.roles
+
+    @property
     def memory(self) -> int:
         return max(self.first.memory, self.second.memory)
 
@@ -197,6 +216,12 @@ class Combined(Model):
         self.n_joints = first.n_joints
 
     @property
+    def roles(self) -> tuple[Role, ...]:
+        """Of merged parameters that of the first."""
+        both = self.first.roles + self.second.roles
+        return tuple(both[row.index(1.0)] for row in self.merge)
+
+    @property
     def memory(self) -> int:
         return max(self.first.memory, self.second.memory)
 
@@ -239,6 +264,10 @@ class Joints(Model):
         self.label = models[0].label
         self.n_joints = len(models)
         _shared_rate(*models)
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        return tuple(role for model in self.models for role in model.roles)
 
     @property
     def memory(self) -> int:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from jaximp.models.base import Model
+from jaximp.models.base import Model, Role
 from jaximp.models.reflex import ReflexPathway
 from jaximp.types import AnyArray
 
@@ -75,6 +75,10 @@ class HumanJoint(Model):
             self.names += reflex.names
             self.units += (unit["damping"],) * len(reflex.names)
             self.columns += reflex.columns
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        return tuple(Role(name if name in ("inertia", "damping", "stiffness") else "other") for name in self.names)
 
     @property
     def memory(self) -> int:
@@ -176,6 +180,11 @@ class RobotJoint(Model):
         self.label = "robot"
         self.n_joints = 1
         self.width = None
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        kinds = {"inertia": "inertia", "viscous_friction": "friction", "coulomb_friction": "friction"}
+        return tuple(Role(kinds.get(name, "other")) for name in self.names)
 
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         return eqx.tree_at(lambda robot: robot.width, self, jnp.asarray(width), is_leaf=lambda x: x is None)

@@ -27,7 +27,8 @@ from jaximp.models.arm import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk, SixthOrder, Trajectory, jerk
 from jaximp.perturbation.trials import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials
 from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold, imposed_motion
-from jaximp.trust.verdicts import TrustLimits, confidence, matrix_criteria
+from jaximp.trust.criteria import confidence, matrix_criteria
+from jaximp.trust.limits import TrustLimits
 from jaximp.types import Numbers, Progress
 
 ARM = PlanarArm((0.0, 0.0))

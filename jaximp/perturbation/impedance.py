@@ -46,16 +46,9 @@ from jaximp.perturbation.stiffness import (
     fit_triangles_linear,
     residual_triangle,
 )
-from jaximp.trust.verdicts import (
-    NO_DATA,
-    POOR,
-    TRUSTED,
-    WEAK,
-    MatrixCriteria,
-    TrustLimits,
-    impossible_body,
-    matrix_criteria,
-)
+from jaximp.trust.criteria import MatrixCriteria, impossible_body, matrix_criteria
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK
 from jaximp.types import AnyArray, Numbers, Progress, nearest
 
 USUAL = TrustLimits()

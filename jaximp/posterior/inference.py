@@ -260,7 +260,7 @@ def posterior_of(
         windows=windows,
         start=time[start],
         end=time[start + place.window - 1],
-        verdicts=Verdicts(verdicts.verdict[kept], verdicts.reason[kept]),
+        verdicts=verdicts[kept],
         left_out=tuple(f"{time[first]:.4g} s: {why}" for first, why in left_out),
         gains=_gains(data.model),
         noise=data.noise,

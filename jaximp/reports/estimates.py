@@ -177,11 +177,25 @@ def summary(
     return without_nan(content)
 
 
-def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | None = None) -> pa.Table:
-    """One row per window. A column's unit is its field's metadata `unit`; the job's text is in the schema's.
+def estimates_table(
+    estimates: Estimates | Sequence[Estimates], human_model: Model | None, job: Job | None = None
+) -> pa.Table:
+    """One row per window, of one recording or of several. A column's unit is its field's metadata `unit`; the job's
+    text is in the schema's.
 
     **Arguments:** `human_model` adds the equilibrium position of every human joint with an offset.
     """
+    several = [estimates] if isinstance(estimates, Estimates) else estimates
+    each = [_columns_of(one, human_model) for one in several]
+    columns = [
+        (same[0][0], same[0][1], np.concatenate([np.asarray(values) for _, _, values in same]))
+        for same in zip(*each, strict=True)
+    ]
+    return table_of(columns, "" if job is None else job.text)
+
+
+def _columns_of(estimates: Estimates, human_model: Model | None) -> list[tuple[str, str, Any]]:
+    """Name, unit and values of every column."""
     fit = estimates.fit
     theta, stderr = np.asarray(fit.theta), np.asarray(fit.stderr)
     columns: list[tuple[str, str, Any]] = [("start_s", "s", estimates.start), ("end_s", "s", estimates.end)]
@@ -210,7 +224,7 @@ def estimates_table(estimates: Estimates, human_model: Model | None, job: Job | 
         ("verdict", "", estimates.verdicts.verdict),
         ("reason", "", estimates.verdicts.reason),
     ]
-    return table_of(columns, "" if job is None else job.text)
+    return columns
 
 
 @dataclass(frozen=True)

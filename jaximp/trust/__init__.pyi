@@ -1,7 +1,9 @@
-from .verdicts import Confidence as Confidence
-from .verdicts import MatrixCriteria as MatrixCriteria
-from .verdicts import TrustLimits as TrustLimits
+from .criteria import Confidence as Confidence
+from .criteria import MatrixCriteria as MatrixCriteria
+from .criteria import confidence as confidence
+from .criteria import fake_change_threshold as fake_change_threshold
+from .criteria import matrix_criteria as matrix_criteria
+from .limits import TrustLimits as TrustLimits
+from .verdicts import Rule as Rule
+from .verdicts import Verdict as Verdict
 from .verdicts import Verdicts as Verdicts
-from .verdicts import confidence as confidence
-from .verdicts import fake_change_threshold as fake_change_threshold
-from .verdicts import matrix_criteria as matrix_criteria

@@ -1,0 +1,38 @@
+"""What an estimate must keep to be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrustLimits:
+    """What a window must keep to be trusted."""
+
+    min_vaf: float = 0.75
+    """Share of the torque's variance that the model must explain."""
+    max_residual_ratio: float = 4.0
+    """Largest residual and largest unexplained share of the torque's variance, as multiples of their lower quartiles
+    over the excited windows: where both are above, something happened that the model does not know, such as a parameter
+    that changes inside the window."""
+    min_dof: float = 3.0
+    """Fewest degrees of freedom: with less a standard error is itself a matter of luck."""
+    max_negative_inertia: float = 5.0
+    """How far below zero an inertia or a friction may come out, in standard errors; beyond, torque's sign or model is
+    wrong."""
+    max_relative_stderr: float = 0.2
+    """Largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
+    min_excitation_ratio: float = 5.0
+    """How far each column must rise above what noise in the position alone would build: a ratio r biases the
+    estimate by about 1/r^2, four percent at 5."""
+    min_valid_share: float = 0.5
+    """Share of a window's samples that must have been measured and moving."""
+    max_asymmetry: float = 0.2
+    """Of an arm's stiffness: antisymmetric over symmetric part (Lakatos et al. 2011, eq. 22), if it is beyond error."""
+    errors_apart: float = 2.0
+    """A window's matrix is not positive definite, or not symmetric, if that is so by so many standard errors; and it is
+    surely positive definite (`confidence`) by so many."""
+    max_condition: float | None = None
+    """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
+    parameters: tuple[str, ...] = ()
+    """The parameters that matter: only their standard errors and excitation are judged. Empty for all of them."""

@@ -1,0 +1,302 @@
+"""Which windows to believe: what is measured of them, and the table of rules.
+
+The condition number alone cannot tell: on a still arm, noise builds a well conditioned regressor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.least_squares.window import SlidingFit
+from jaximp.models.base import Role
+from jaximp.trust.criteria import MatrixCriteria, impossible_body, matrix_criteria
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, WEAK, Rule, Verdicts, judge_all
+from jaximp.types import Numbers, nearest
+
+USUAL = TrustLimits()
+POSITIVE_INERTIA = "an inertia above zero"
+"""The rule that a wrong sign of the torque breaks."""
+MASSES = (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,)))
+"""What cannot be below zero."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What is measured of M windows and their estimates. Numbers of all windows stand in arrays (M,); of one window,
+    which is what reasons are made of, they are scalars."""
+
+    parameters: int
+    """How many there are."""
+    full: int
+    """Torque samples in a complete window."""
+    samples: Any
+    """That counted."""
+    determined: Any
+    """Whether all parameters are finite."""
+    above_noise: Any
+    """How far the least excited column rises above what position noise alone would build."""
+    least_excited: Any
+    """The parameter of that column."""
+    dof: Any
+    relative_stderr: Any
+    """The largest standard error, as a share of the parameter or of what would explain the whole torque by itself."""
+    loosest: Any
+    """The parameter that has it."""
+    cond: Any
+    threshold: float
+    """Of eq. (16) on the condition number; infinite where it does not apply."""
+    vaf: Any
+    residual: Any
+    """[N m]"""
+    usual_residual: float
+    """Lower quartile over the windows that are excited; infinite until these are known."""
+    usual_unexplained: float
+    """The same of `1 - vaf`."""
+    negative_inertia: Any
+    """How far the inertia is below zero, in standard errors; minus infinity without one."""
+    negative_friction: Any
+    """The same of the friction that is farthest below."""
+    driving: Any
+    """Which friction that is."""
+    no_body: Any
+    """Whether an arm's inertia is that of no rigid body, by `limits.errors_apart`."""
+    stiffness: MatrixCriteria | None
+    """Of an arm."""
+    damping: MatrixCriteria | None
+
+    def one(self, k: int) -> Windows:
+        """What is measured of one window."""
+        return self._map(lambda x: x[k])
+
+    def some(self, which: NDArray[np.int64]) -> Windows:
+        """What is measured of some windows."""
+        return self._map(lambda x: x[which])
+
+    def _map(self, pick: Callable[[Any], Any]) -> Windows:
+        def picked(value: Any) -> Any:
+            if isinstance(value, MatrixCriteria):
+                return MatrixCriteria(*(np.atleast_1d(pick(getattr(value, field.name))) for field in fields(value)))
+            return pick(value) if isinstance(value, np.ndarray) else value
+
+        return Windows(**{field.name: picked(getattr(self, field.name)) for field in fields(self)})
+
+
+def measure_windows(
+    fit: SlidingFit,
+    names: Sequence[str],
+    roles: Sequence[Role],
+    window_samples: int,
+    parameter_scale: NDArray[np.float64],
+    column_noise: NDArray[np.float64],
+    threshold: float | None = None,
+    limits: TrustLimits = USUAL,
+) -> Windows:
+    """What the rules look at.
+
+    **Arguments:** `names` and `roles` (p) of the parameters; `window_samples` torque samples in a full window;
+    `parameter_scale` (p,) the size of each parameter that would explain the whole recording's torque by itself;
+    `column_noise` (p,) root mean square of each column that noise in the position alone gives; `threshold` of eq. (16).
+
+    **Raises:** `ValueError` for `limits.parameters` that do not exist.
+    """
+    # One row per parameter: what is worked out over the parameters then runs along the windows.
+    theta, stderr, excitation = (np.ascontiguousarray(np.asarray(x).T) for x in (fit.theta, fit.stderr, fit.excitation))
+    samples, cond, vaf, residual, dof = (
+        np.asarray(x) for x in (fit.samples, fit.cond, fit.vaf, fit.residual_rms, fit.dof)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = stderr / np.maximum(np.abs(theta), parameter_scale[:, None])
+        built_by_noise = np.sqrt(samples) * column_noise[:, None]
+        ratio = np.where(built_by_noise > 0, excitation / built_by_noise, np.inf)
+        below_zero = -theta / stderr
+    judged = _judged(names, limits.parameters)[:, None]
+    error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
+    mass = np.array(
+        [role in (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,))) for role in roles]
+    )
+    friction = np.array([role.kind == "friction" for role in roles])
+    negative_friction = np.where(friction[:, None], below_zero, -np.inf)
+    named, called = np.asarray(names), [_element(role) for role in roles]
+    stiffness, damping = (matrix_criteria(called, which, fit.theta, fit.stderr) for which in ("stiffness", "damping"))
+    return Windows(
+        parameters=len(names),
+        full=window_samples,
+        samples=samples,
+        determined=np.isfinite(theta).all(axis=0),
+        above_noise=ratio.min(axis=0),
+        least_excited=named[ratio.argmin(axis=0)],
+        dof=dof,
+        relative_stderr=error.max(axis=0),
+        loosest=named[error.argmax(axis=0)],
+        cond=cond,
+        threshold=np.inf if threshold is None else threshold,
+        vaf=vaf,
+        residual=residual,
+        usual_residual=np.inf,
+        usual_unexplained=np.inf,
+        negative_inertia=np.where(mass[:, None], below_zero, -np.inf).max(axis=0),
+        negative_friction=negative_friction.max(axis=0),
+        driving=named[negative_friction.argmax(axis=0)],
+        no_body=impossible_body(called, fit.theta, fit.stderr, limits.errors_apart),
+        stiffness=stiffness,
+        damping=damping,
+    )
+
+
+def judge_windows(windows: Windows, limits: TrustLimits = USUAL) -> Verdicts:
+    """The verdict on every window: that of the first of `RULES` that it breaks."""
+    excited = ~np.any([rule.broken(windows, limits) for rule in EXCITATION], axis=0)
+    usual = replace(
+        windows,
+        usual_residual=_lower_quartile(windows.residual[excited]),
+        usual_unexplained=_lower_quartile(1 - windows.vaf[excited]),
+    )
+    return judge_all(RULES, usual, limits)
+
+
+def _judged(names: Sequence[str], chosen: Sequence[str]) -> NDArray[np.bool_]:
+    """Which parameters the verdict looks at."""
+    for name in chosen:
+        if name not in names:
+            raise ValueError(f"trust.parameters has an unknown parameter '{name}': {nearest(name, list(names))}")
+    return np.array([not chosen or name in chosen for name in names])
+
+
+def _element(role: Role) -> str:
+    """As the criteria call it: `stiffness_12` for the stiffness between joints 1 and 2."""
+    kind = "inertia" if role.kind == "base_inertia" else role.kind
+    return f"{kind}_{''.join(map(str, role.element))}" if role.element else kind
+
+
+def _lower_quartile(values: Numbers) -> float:
+    """Of the values above zero: a window without any torque has no residual to compare with."""
+    known = values[np.isfinite(values) & (values > 0)]
+    return float(np.quantile(known, 0.25)) if len(known) else np.inf
+
+
+def _indefinite(which: str) -> Rule[Windows]:
+    """An arm's stiffness and damping store and take energy."""
+
+    def found(w: Windows) -> MatrixCriteria | None:
+        return w.stiffness if which == "stiffness" else w.damping
+
+    def broken(w: Windows, limits: TrustLimits) -> Any:
+        matrix = found(w)
+        return np.zeros(len(w.cond), bool) if matrix is None else matrix.surely_indefinite(limits.errors_apart)
+
+    def reason(w: Windows, limits: TrustLimits) -> str:
+        matrix = found(w)
+        assert matrix is not None
+        return f"the {which} is not positive definite: its smallest eigenvalue is {matrix.eigenvalues[0]:.3g}"
+
+    return Rule(f"a {which} that is positive definite", POOR, broken, reason)
+
+
+def _asymmetric(w: Windows, limits: TrustLimits) -> Any:
+    return np.zeros(len(w.cond), bool) if w.stiffness is None else w.stiffness.surely_asymmetric(limits)
+
+
+def _asymmetry(w: Windows, limits: TrustLimits) -> str:
+    assert w.stiffness is not None
+    return f"the stiffness is not symmetric: its antisymmetric part is {w.stiffness.asymmetry[0]:.0%}"
+
+
+EXCITATION: tuple[Rule[Windows], ...] = (
+    Rule(
+        "enough samples",
+        NO_DATA,
+        lambda w, limits: (w.samples < limits.min_valid_share * w.full) | (w.samples < w.parameters),
+        lambda w, limits: f"{w.samples} of {w.full} samples can be used",
+    ),
+    Rule(
+        "columns that differ",
+        WEAK,
+        lambda w, limits: ~w.determined,
+        lambda w, limits: "columns are zero or collinear: the parameters cannot be told apart",
+    ),
+    Rule(
+        "columns above the position's noise",
+        WEAK,
+        lambda w, limits: w.above_noise < limits.min_excitation_ratio,
+        lambda w, limits: (
+            f"{w.least_excited}: its column is {w.above_noise:.2g} times what position noise alone builds"
+        ),
+        lambda w, limits: "move more, or filter more (filter.position_cutoff)",
+    ),
+    Rule(
+        "enough degrees of freedom",
+        WEAK,
+        lambda w, limits: w.dof < limits.min_dof,
+        lambda w, limits: f"{w.dof:.2g} degrees of freedom are too few to know its own errors",
+    ),
+    Rule(
+        "small standard errors",
+        WEAK,
+        lambda w, limits: ~(w.relative_stderr <= limits.max_relative_stderr),
+        lambda w, limits: f"{w.loosest}: its standard error is {w.relative_stderr:.0%} of its size",
+    ),
+    Rule(
+        "a small condition number",
+        WEAK,
+        lambda w, limits: w.cond > (np.inf if limits.max_condition is None else limits.max_condition),
+        lambda w, limits: f"the condition number {w.cond:.3g} is above {limits.max_condition:.3g}",
+    ),
+)
+"""What the motion must be for an estimate to say something."""
+
+RULES: tuple[Rule[Windows], ...] = (
+    *EXCITATION,
+    Rule(
+        "no fake change, eqs. (16), (17) of Tout et al. 2023",
+        FAKE,
+        lambda w, limits: np.isfinite(w.threshold) & ~(w.cond < w.threshold),
+        lambda w, limits: f"the condition number {w.cond:.3g} is not below the threshold {w.threshold:.3g}",
+    ),
+    Rule(
+        "variance accounted for",
+        POOR,
+        lambda w, limits: ~(w.vaf >= limits.min_vaf),
+        lambda w, limits: f"the model explains {w.vaf:.0%} of the torque's variance",
+    ),
+    Rule(
+        "a residual as in other windows",
+        POOR,
+        # Both: a larger motion has a larger residual, a smaller one explains a smaller share, and neither is wrong.
+        lambda w, limits: (
+            (w.residual > limits.max_residual_ratio * w.usual_residual)
+            & (1 - w.vaf > limits.max_residual_ratio * w.usual_unexplained)
+        ),
+        lambda w, limits: f"the residual is {w.residual / w.usual_residual:.2g} times that of other windows",
+        lambda w, limits: "did the joint change here?",
+    ),
+    Rule(
+        POSITIVE_INERTIA,
+        POOR,
+        lambda w, limits: w.negative_inertia > limits.max_negative_inertia,
+        lambda w, limits: f"the inertia is negative, as no mass can be, by {w.negative_inertia:.2g} standard errors",
+        lambda w, limits: "does the torque need sign = -1?",
+    ),
+    Rule(
+        "friction above zero",
+        POOR,
+        lambda w, limits: w.negative_friction > limits.max_negative_inertia,
+        lambda w, limits: f"{w.driving} is negative, by {w.negative_friction:.2g} standard errors",
+    ),
+    Rule(
+        "an inertia that a body can have",
+        POOR,
+        lambda w, limits: w.no_body,
+        lambda w, limits: "no rigid body has this inertia",
+        lambda w, limits: "are the joints swapped, or the angles in other units?",
+    ),
+    _indefinite("damping"),
+    _indefinite("stiffness"),
+    Rule("a stiffness that is symmetric", POOR, _asymmetric, _asymmetry),
+)
+"""From what leaves nothing to judge to what makes an estimate doubtful."""
