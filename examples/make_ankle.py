@@ -1,7 +1,7 @@
 """Makes ankle.csv, the sample recording of this folder: run `python examples/make_ankle.py`.
 
-An actuator moves a tensed ankle by a few degrees. Halfway through the subject pushes harder, and the stiffness doubles. The
-truth is known, so that anybody can compare what `jaximp identify examples/ankle.toml` finds with it.
+An actuator moves a tensed ankle by a few degrees. Halfway through the subject pushes harder, and the stiffness doubles.
+The truth is known, so that anybody can compare what `jaximp identify examples/ankle.toml` finds with it.
 """
 
 from __future__ import annotations

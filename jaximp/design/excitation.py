@@ -73,9 +73,9 @@ class Limits:
     velocity: Any = math.inf
     """Largest speed [rad/s]."""
     acceleration: Any = math.inf
-    """[rad/s^2]."""
+    """Largest acceleration [rad/s^2]."""
     jerk: Any = math.inf
-    """[rad/s^3]."""
+    """Largest jerk [rad/s^3]."""
     torque: Any = math.inf
     """Largest torque of the model [N m]; needs the parameters of the model."""
 

@@ -33,13 +33,16 @@ class FilterSettings:
     """Low-pass of the position before it is differentiated [Hz]; the paper's f_c, above ten natural frequencies. The
     torque does not pass it, so whatever it takes off the motion biases the estimates: leave room above the motion."""
     position_order: int = 8
+    """Order of that low-pass, which runs forward and backward."""
     decimation_cutoff: float | None = None
     """Low-pass of the torque and of every column of the regressor [Hz]; the paper's f_cd, above two natural
     frequencies."""
     decimation_order: int = 4
+    """Order of that low-pass."""
     high_pass: float | None = None
     """High-pass of the torque and of every column [Hz], which takes slow drift out of both sides."""
     high_pass_order: int = 2
+    """Order of that high-pass."""
     decimate: int | None = None
     """Keep every n-th sample after the filters; by default five samples per period of `decimation_cutoff`."""
     mode: str = "once"
@@ -68,12 +71,19 @@ class RobotSettings:
     """Columns of `models.RobotJoint`."""
 
     gear_ratio: float = 1.0
+    """Motor turns per joint turn, where position and torque stay on the motor's side."""
     gravity: bool | None = None
+    """Columns of gravity (sine and cosine of the angle); by default they are there for a revolute joint."""
     viscous: bool = True
+    """A column of viscous friction."""
     coulomb: bool = True
+    """A column of Coulomb friction."""
     inertia: bool = True
+    """A column of inertia."""
     offset: bool = False
+    """A column of a constant torque."""
     g: float = 9.81
+    """Acceleration of gravity [m/s^2]."""
 
     def make(self, sample_rate: float | None = None, joint: str = "revolute") -> RobotJoint:
         """The model; it does not depend on the sample rate."""
@@ -89,8 +99,8 @@ class ReflexSettings:
     last: float = 0.49
     """Longest lag [s], by which the reflex should have ended."""
     count: int = 31
-    """How many. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart; twice as far
-    apart they miss what is between, and every estimate is biased."""
+    """How many lags there are. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart;
+    twice as far apart they miss what is between, and every estimate is biased."""
     direction: int = 1
     """1 where a velocity above zero stretches the muscle, else -1."""
 
@@ -107,9 +117,11 @@ class HumanSettings:
     """Columns of `models.HumanJoint`."""
 
     offset: bool = True
+    """A column of the offset torque, which is minus the stiffness times the equilibrium angle."""
     gear_ratio: float = 1.0
+    """Motor turns per joint turn, where position and torque stay on the motor's side."""
     reflex: bool | ReflexSettings = False
-    """`true`, or a table with some of the settings: the stretch reflex."""
+    """The stretch reflex: `true`, or a table with some of its settings."""
 
     def make(self, sample_rate: float | None = None, joint: str = "revolute") -> HumanJoint:
         """The model, for recordings of a sample rate [Hz], which only a reflex needs."""
@@ -132,17 +144,23 @@ class ArmSettings:
     equilibrium: list[float] | None = None
     """Two angles [rad]; damping and stiffness about them are identified where it is given."""
     inertia: bool = True
+    """Columns of the three base inertial parameters."""
     gravity: bool = False
+    """Columns of gravity: the arm does not move in a horizontal plane."""
     viscous: bool = False
+    """A column of viscous friction for each joint."""
     coulomb: bool = False
+    """A column of Coulomb friction for each joint."""
     offset: bool = False
+    """A column of a constant torque for each joint."""
     rotor: bool = False
-    """The inertia of the second motor's rotor behind its gear."""
+    """A column of the inertia of the second motor's rotor behind its gear, which counts on its own joint alone."""
     g: float = 9.81
+    """Acceleration of gravity [m/s^2]."""
     zero: str = "horizontal"
     """Where gravity acts: at angles of zero the arm is `horizontal`, or `hanging`."""
     length: float | None = None
-    """Of the upper arm [m]: ties inertia to gravity."""
+    """Length of the upper arm [m], if it is known: it ties the inertia to the gravity."""
 
     def make(self) -> PlanarArm:
         """The model."""
@@ -160,7 +178,8 @@ class ModelSettings:
     hand_arm: HandArmSettings | None = None
     """`[model.arm]` of a job with `[trials]`."""
     methods: tuple[int, ...] = (1,)
-    """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
+    """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
+    beside it."""
 
 
 @dataclass(frozen=True)
@@ -168,8 +187,9 @@ class PosteriorSettings:
     """`[posterior]`: what posteriors are drawn with."""
 
     seed: int = 0
+    """Seed of the random numbers: the same seed gives the same draws."""
     ess: float = 1000.0
-    """Effective samples of every parameter."""
+    """Effective samples that are drawn of every parameter."""
     heavy_tails: bool = False
     """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
     prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)

@@ -18,7 +18,9 @@ class Normal:
     """A parameter known as `mean` give or take the standard deviation `sd`, in its own unit."""
 
     mean: float
+    """The most likely value, in the parameter's unit."""
     sd: float
+    """The standard deviation, in the parameter's unit."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,9 @@ class LogNormal:
     """A positive parameter, with even odds above `median`, and with 68 % within a `factor` of it."""
 
     median: float
+    """The value that the parameter exceeds with even odds, in its unit."""
     factor: float
+    """The parameter lies between `median / factor` and `median * factor` with a probability of 68 %."""
 
 
 @dataclass(frozen=True, eq=False)
