@@ -13,9 +13,8 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import click
 import numpy as np
 import pytest
 import typer
@@ -60,6 +59,12 @@ def jaximp_commands(page: Path) -> list[str]:
     return [command for command in commands(page) if command.startswith(".venv/bin/jaximp ")]
 
 
+def marked(values: list[Any]) -> list[Any]:
+    """Parameters of a test: what draws from posteriors or designs is slow."""
+    slow = [any(word in str(value) for word in ("posterior", "design")) for value in values]
+    return [pytest.param(x, marks=pytest.mark.slow if late else ()) for x, late in zip(values, slow, strict=True)]
+
+
 TOML = [block for page in PAGES for block in blocks(page, "toml")]
 WITH_PYTHON = [page for page in PAGES if any(not block.fragment for block in blocks(page, "python"))]
 
@@ -87,7 +92,7 @@ def test_the_first_example_finds_what_it_says() -> None:
     np.testing.assert_allclose(stiffness[-9:], 30, rtol=0.03)
 
 
-@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", marked(WITH_PYTHON), ids=lambda page: page.stem)
 def test_python_runs_as_printed(page: Path, workshop: Path, unchecked: None) -> None:
     names: dict[str, object] = {}
     for block in blocks(page, "python"):
@@ -95,7 +100,7 @@ def test_python_runs_as_printed(page: Path, workshop: Path, unchecked: None) -> 
             exec(compile(block.text, page.name, "exec"), names)
 
 
-@pytest.mark.parametrize("command", jaximp_commands(README))
+@pytest.mark.parametrize("command", marked(jaximp_commands(README)))
 def test_commands_of_the_readme_run_as_printed(command: str, workshop: Path) -> None:
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -105,14 +110,13 @@ def test_commands_of_the_readme_run_as_printed(command: str, workshop: Path) -> 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_all_commands_exist(page: Path) -> None:
     """Commands and options are known, extras are in pyproject.toml, targets in the Makefile."""
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
+    known: Any = typer.main.get_command(app)
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     for command in commands(page):
         program, *arguments = command.split()
         if program == ".venv/bin/jaximp":
-            assert arguments[0] in group.commands, command
-            group.commands[arguments[0]].make_context(arguments[0], arguments[1:])
+            assert arguments[0] in known.commands, command
+            known.commands[arguments[0]].make_context(arguments[0], arguments[1:])
         elif program == "make":
             done = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
