@@ -321,7 +321,10 @@ def _problem(
 ) -> _Problem:
     """The settings, checked."""
     if model.n_joints != moved.n_joints:
-        raise ValueError(f"the model has {model.n_joints} joints, but the one of what is moved {moved.n_joints}")
+        raise ValueError(
+            f"the model has {model.n_joints} joints, but that of what is moved has {moved.n_joints}: give both the "
+            "same joints"
+        )
     _check_motion(harmonics, period, sample_rate, window, rest, encoder)
     _check_objective(model, objective, parameter)
     low, high, most = room(limits, model.n_joints)
@@ -368,7 +371,10 @@ def _check_motion(
     if window is not None and not 0 < window <= period:
         raise ValueError(f"window is {window:g} s: it must be above zero and no longer than the period of {period:g} s")
     if encoder is not None and not round(period * encoder.sample_rate) >= 2 * harmonics:
-        raise ValueError("the encoder takes fewer than two samples in a period of the highest harmonic")
+        raise ValueError(
+            "the encoder takes fewer than two samples in a period of the highest harmonic: raise its sample rate, or "
+            "give fewer harmonics"
+        )
 
 
 def _check_objective(model: Model, objective: str, parameter: str | None) -> None:

@@ -41,11 +41,11 @@ from jaximp.types import Recording, nearest
 TASKS = ("movement", "posture")
 """What the subject does: move and be perturbed at times, or keep a posture."""
 STATIC_WINDOW = 0.4
-"""After the onset of a perturbed posture, from which the inertia is estimated [s]."""
+"""Time after the onset of a perturbed posture from which the inertia is estimated [s]."""
 _POSTURE = ("files", "file", "trial", "onset", "window")
 """Keys of `[trials.posture]` beside the columns."""
 _ASKED = ("command", "reference")
-"""Columns of which a table has its own, or another table's."""
+"""Columns that say what was asked for: `[trials.posture]` names its own, or takes that of `[trials]`."""
 _FIXED = ("joint", "gear_ratio", "name", "force")
 """Keys of `load_recording` that have no meaning for a hand in a plane."""
 

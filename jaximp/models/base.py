@@ -300,5 +300,7 @@ def _shared_rate(*models: Model) -> float | None:
 
 def _check_joints(first: Model, second: Model) -> None:
     if first.n_joints != second.n_joints:
-        raise ValueError(f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked")
+        raise ValueError(
+            f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked: give both the same"
+        )
     _shared_rate(first, second)

@@ -296,7 +296,7 @@ def estimate_density(
     names, covariance = tuple(names), np.asarray(covariance, float)
     root = _inverse_root(covariance, "the estimate")
     if not (np.isfinite(np.asarray(theta)).all() and 0 < float(dof) < np.inf):
-        raise ValueError("the estimate or its degrees of freedom are not finite: there must be an estimate")
+        raise ValueError("there is no estimate to draw around: its numbers, or its degrees of freedom, are not finite")
     likelihood = StudentEstimate(np.asarray(theta, float), root, np.asarray(dof, float))
     prior = _prior_for(prior, names)
     if names != STIFFNESS:
@@ -448,7 +448,7 @@ def _element_columns(R: Array) -> Array:
 def _prior_for(prior: Prior | None, names: tuple[str, ...]) -> Prior:
     prior = make_prior(names) if prior is None else prior
     if prior.names != names:
-        raise ValueError(f"the prior is one of {', '.join(prior.names)}: it must be one of {', '.join(names)}")
+        raise ValueError(f"the prior is for {', '.join(prior.names)}: make it for {', '.join(names)}")
     return prior
 
 

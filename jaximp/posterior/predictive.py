@@ -51,7 +51,7 @@ def log_scores(samples: Num[AnyArray, "draws P"], rows: WhiteRows, *, heavy_tail
     samples, p = np.asarray(samples, float), rows.W.shape[-1]
     if samples.shape[1] != p + len(rows.count):
         raise ValueError(
-            f"samples have {samples.shape[1]} columns: {p} parameters and {len(rows.count)} logarithms of noise must be"
+            f"samples have {samples.shape[1]} columns: give {p} parameters and {len(rows.count)} logarithms of noise"
         )
     nu = jnp.asarray(NU if heavy_tails is True else float(heavy_tails))
     out = np.zeros(rows.y.shape)

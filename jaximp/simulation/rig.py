@@ -251,7 +251,7 @@ class RigMotion(eqx.Module):
     """What the rig measures, and the truth behind it. Every array has one value for each of the N records."""
 
     time: Float[Array, " N"]
-    """[s], from 0."""
+    """Time from zero on [s]."""
     position: Float[Array, " N"]
     """Measured: quantised motor angle [rad]."""
     torque: Float[Array, " N"]
