@@ -475,7 +475,7 @@ def test_bad_data(tmp_path: Path, columns: dict[str, Any], message: str) -> None
         pytest.param({"position": {"column": "q1", "unit": "mm"}}, "'mm' does not convert to 'rad'", id="length"),
         pytest.param({"velocity": {"column": "q1", "unit": "Hz"}}, "'Hz' does not convert to 'rad/s'", id="hertz"),
         pytest.param({"torque": {"column": "q1", "gain": "3 N/V"}}, "does not convert to 'N m'", id="gain-unit"),
-        pytest.param({"torque": {"column": "q1", "gain": "__import__('os')"}}, "is not a number", id="gain-text"),
+        pytest.param({"torque": {"column": "q1", "gain": "__import__('os')"}}, "gain must be a number", id="gain-text"),
         pytest.param({"torque": {"column": "q1", "gain": 0}}, "gain must be a number other than 0", id="gain-zero"),
         pytest.param({"torque": {"column": "q1", "sign": 2}}, "sign must be 1 or -1, not 2", id="sign"),
         pytest.param({"gear_ratio": 0}, "gear_ratio must be a positive number, not 0", id="gear-zero"),
