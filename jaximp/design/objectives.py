@@ -43,7 +43,7 @@ def _derivative_of_extremes(primals: tuple[Array], tangents: tuple[Array]) -> tu
 
 
 def _null_vector(matrix: Float[Array, "*M p p"]) -> Float[Array, "*M p"]:
-    """Unit eigenvectors of the smallest eigenvalue of positive semidefinite matrices, by inverse iteration."""
+    """Unit vectors that positive semidefinite matrices nearly annihilate, by inverse iteration."""
     p = matrix.shape[-1]
     lanes, shape = _lanes(matrix), matrix.shape[:-2]
     # No eigenvector is orthogonal to this start but by chance.
@@ -55,7 +55,7 @@ def _null_vector(matrix: Float[Array, "*M p p"]) -> Float[Array, "*M p"]:
 
 
 def _lanes(matrices: Float[Array, "*M p p"]) -> Float[Array, "p p lanes"]:
-    """Put the matrices side by side along the last axis, where `engine` works on all of them at a time."""
+    """Matrices side by side along the last axis, where `engine` works on all of them at a time."""
     p = matrices.shape[-1]
     return jnp.moveaxis(matrices.reshape(-1, p, p), 0, -1)
 

@@ -53,7 +53,7 @@ class Experiment(eqx.Module):
     """The dynamic and the static task of one simulation."""
 
     perturbed: Movements
-    """The 60 perturbed trials."""
+    """60 trials."""
     twins: Movements
     """The same trials without the perturbation."""
     unperturbed: Movements | None

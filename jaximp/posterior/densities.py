@@ -34,8 +34,7 @@ FLAT = 1e-12
 NO_NOISE = 1e-12
 """Residuals that are smaller than this share of the torque are taken as rounding."""
 STEPS, DECREMENT = 60, 1e-14
-"""Newton's method takes so many steps at most, and ends at this squared distance from the mode, in standard
-deviations."""
+"""Of Newton's method: how many at most, and the squared distance from the mode, in standard deviations, at its end."""
 STIFFNESS = tuple(name for name in ELEMENTS if name != "K21")
 FACTOR = ("l11", "l21", "l22")
 UNITS = ("N m s/rad",) * 4 + ("N m/rad",) * 3

@@ -203,5 +203,5 @@ def true_values(arm: NeuromuscularArm, moved: Reaches, seed: int = 0) -> dict[st
 
 
 def _symmetric(upper: Numbers) -> Numbers:
-    """The symmetric (2, 2) matrix of K11, K12, K22."""
+    """(2, 2) of K11, K12, K22."""
     return upper[np.array([[0, 1], [1, 2]])]
