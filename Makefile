@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint studies notebooks lock clean
+.PHONY: setup demo test lint studies notebooks job-keys lock clean
 
 setup: .venv/ready
 
@@ -31,6 +31,10 @@ studies: setup
 # Runs the notebooks and keeps them with their results.
 notebooks: setup
 	$(BIN)/jupyter-execute --inplace --NotebookClient.record_timing=False notebooks/*.ipynb
+
+# The reference of all keys of a job file, from the code.
+job-keys: setup
+	$(BIN)/python docs/make_job_keys.py
 
 # Pinned versions for every supported Python, without any download address.
 lock: setup

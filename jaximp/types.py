@@ -71,7 +71,7 @@ class Recording:
 
 
 MOST_CHOICES = 50
-"""That a hint names."""
+"""How many choices a hint names."""
 
 
 def nearest(name: str, choices: list[str]) -> str:

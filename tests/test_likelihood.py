@@ -480,7 +480,7 @@ def test_impossible_blocks_are_refused() -> None:
     with pytest.raises(ValueError, match="was there an estimate"):
         make_prior(NAMES, blocks=[MultivariateNormal(block.names, np.zeros(2), np.full((2, 2), np.nan))])
     W, y = record()
-    with pytest.raises(ValueError, match="must be one of inertia"):
+    with pytest.raises(ValueError, match="make it for inertia"):
         linear_density(NAMES, UNITS, whiten(W, y), make_prior(NAMES))
 
 

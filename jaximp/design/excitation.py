@@ -44,9 +44,9 @@ OBJECTIVES = {
     "stderr": "standard error of one parameter",
 }
 PER_CYCLE = 24
-"""Instants in a period of the highest harmonic at which a motion is judged while it is designed."""
+"""How many instants of a period of the highest harmonic a motion is judged at, while it is designed."""
 FINER = 10
-"""The result keeps its limits on a grid that is so many times finer."""
+"""The result must keep its limits on a grid that is so many times finer."""
 STAGES = ((0.1, 20.0), (0.01, 200.0))
 """While a motion is designed, dry friction changes its sign within such a share of the largest velocity, and the worst
 window is a smooth maximum of such sharpness."""
@@ -55,15 +55,16 @@ TOUCHING = 1e-12
 MOST_STEPS = 60
 ROUNDING = 1e-12
 DESCENDING = 16
-"""Windows in the length of one that are looked at while a motion is designed; the result is judged by all."""
+"""While a motion is designed, a new window starts so many times in the length of one; the result is judged by all
+windows."""
 BATCH = 8
-"""Starts that are minimised together; several batches at a time, one on each core."""
+"""How many starts are minimised together; each core has one batch at a time."""
 ACTIVE = 0.999
 """A limit is active where the motion reaches such a share of it."""
 COLLINEAR = 1e6
-"""From such a condition number on, parameters cannot be told apart."""
+"""From this condition number on, parameters cannot be told apart."""
 INFEASIBLE = 50.0
-"""Objective where not even rest is allowed: above the logarithm of any condition number."""
+"""The objective where not even rest is allowed: it is above the logarithm of any condition number."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +76,9 @@ class Limits:
     velocity: Any = math.inf
     """Largest speed [rad/s]."""
     acceleration: Any = math.inf
-    """[rad/s^2]."""
+    """Largest acceleration [rad/s^2]."""
     jerk: Any = math.inf
-    """[rad/s^3]."""
+    """Largest jerk [rad/s^3]."""
     torque: Any = math.inf
     """Largest torque of the model [N m]; needs the parameters of the model."""
 
@@ -105,11 +106,11 @@ class Design:
     condition: float
     """Condition number of the regressor over one period."""
     worst_condition: float
-    """That of the worst sliding window, if windows were designed for, else of the period."""
+    """Condition number of the worst sliding window if windows were designed for, otherwise that of the period."""
     lower_bound: float
     """No motion has a smaller condition number over a period; NaN where no bound is known."""
     bound_source: str
-    """Where the bound comes from, or why there is none."""
+    """Where the lower bound comes from, or why none is known."""
     period: float
     """[s]."""
     objective: str
@@ -122,16 +123,16 @@ class Design:
     conditions: Numbers
     """Condition number, over the period or of the worst window, that every start has reached; best first."""
     parameters: Numbers | None = None
-    """Those of the model of everything that is moved, where they were given."""
+    """Parameters of the model of everything that is moved, where they were given."""
     window: float | None = None
     """Length of the windows that were designed for [s]."""
     moved: Model | None = None
-    """The model of everything that is moved, if that is more than is to be identified."""
+    """The model of everything that is moved, where that is more than what is identified."""
     parameter: str | None = None
-    """Whose standard error was made small."""
+    """The parameter whose standard error was made small."""
 
     def in_words(self) -> list[str]:
-        """What was found, a line for each fact."""
+        """The result in words, one line for each fact."""
         lines = [f"condition number over a period of {self.period:g} s: {self.condition:.4g}"]
         if self.objective != "condition":
             lines.insert(0, self._objective_in_words())
@@ -193,7 +194,7 @@ class Design:
 
 
 def _above(condition: float, bound: float) -> str:
-    """How far a condition number is above its bound, in words."""
+    """Say in words how far a condition number is above its bound."""
     share = condition / bound - 1
     if share < 1e-4:
         return "at"
@@ -201,7 +202,7 @@ def _above(condition: float, bound: float) -> str:
 
 
 class _Problem(eqx.Module):
-    """What is designed, as arrays and static settings."""
+    """The design problem, as arrays and static settings."""
 
     model: Model
     moved: Model
@@ -215,16 +216,16 @@ class _Problem(eqx.Module):
     """(4, n) limits of velocity, acceleration, jerk and torque."""
     parameters: Array | None
     scale: Array
-    """(p,) what the columns are multiplied by."""
+    """(p,) factors by which the columns are multiplied."""
     mean: Array | None
     """(n,) mean position, where it is given."""
     objective: str = eqx.field(static=True)
     parameter: int = eqx.field(static=True)
     window: float | None = eqx.field(static=True)
-    """As a share of the period."""
+    """Length of the window as a share of the period."""
     encoder: Encoder | None = eqx.field(static=True)
     samples: float = eqx.field(static=True)
-    """Measurements in one period."""
+    """How many measurements one period has."""
 
     @property
     def n(self) -> int:
@@ -322,7 +323,10 @@ def _problem(
 ) -> _Problem:
     """The settings, checked."""
     if model.n_joints != moved.n_joints:
-        raise ValueError(f"the model has {model.n_joints} joints, but the one of what is moved {moved.n_joints}")
+        raise ValueError(
+            f"the model has {model.n_joints} joints, but that of what is moved has {moved.n_joints}: give both the "
+            "same joints"
+        )
     _check_motion(harmonics, period, sample_rate, window, rest, encoder)
     _check_objective(model, objective, parameter)
     low, high, most = room(limits, model.n_joints)
@@ -369,7 +373,10 @@ def _check_motion(
     if window is not None and not 0 < window <= period:
         raise ValueError(f"window is {window:g} s: it must be above zero and no longer than the period of {period:g} s")
     if encoder is not None and not round(period * encoder.sample_rate) >= 2 * harmonics:
-        raise ValueError("the encoder takes fewer than two samples in a period of the highest harmonic")
+        raise ValueError(
+            "the encoder takes fewer than two samples in a period of the highest harmonic: raise its sample rate, or "
+            "give fewer harmonics"
+        )
 
 
 def _check_objective(model: Model, objective: str, parameter: str | None) -> None:
@@ -418,7 +425,7 @@ def _per_parameter(name: str, values: Any, model: Model) -> Array:
 
 
 def _direction(problem: _Problem, x: Array) -> FourierSeries:
-    """Offsets within their limits, and coefficients as they are."""
+    """Move the offsets inside their limits; leave the coefficients as they are."""
     n, h = problem.n, problem.harmonics
     offset = problem.mean
     if offset is None:
@@ -708,7 +715,7 @@ def _judge(problem: _Problem, x: Array) -> tuple[FourierSeries, Array, Array, Ar
 
 
 def _in_units(problem: _Problem, value: float) -> float:
-    """The objective as the user knows it."""
+    """The objective in the unit in which the user knows it."""
     return math.exp(-value if problem.objective == "sigma_min" else value)
 
 

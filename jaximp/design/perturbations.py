@@ -25,9 +25,9 @@ from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers
 
 SAMPLES = 120
-"""Instants at which a trial is judged."""
+"""How many instants a trial is judged at."""
 FINER = 10
-"""The result keeps its limits on a grid that is so many times finer."""
+"""The result must keep its limits on a grid that is so many times finer."""
 MOST_STEPS = 300
 SMALL = 0.01
 """Displacement [rad] of the motions that the optimiser compares: small enough for the arm to be linear."""
@@ -44,7 +44,7 @@ class Perturbations:
     condition: float
     """Condition number of all trials together."""
     conditions: Numbers
-    """What every start has reached, best first."""
+    """Condition number that every start has reached, the best one first."""
 
     def motion(self, trial: int, t: Num[AnyArray, " N"]) -> tuple[Array, Array, Array]:
         """Displacement (N, 2) [rad] of a trial, velocity and acceleration at the times `t` [s] after the onset."""
@@ -133,7 +133,7 @@ def _scaled(
     high: Array,
     most: Array,
 ) -> tuple[Array, Array]:
-    """The set as large as its limits allow, and its condition number."""
+    """The set of perturbations made as large as its limits allow, and its condition number."""
     points = _from_rest(points)
     fine = _motions(points, observed, FINER * SAMPLES)
     points = points * _largest_factor(posture, fine, inertia, low, high, most)

@@ -22,13 +22,16 @@ class FilterSettings:
     """Low-pass of the position before it is differentiated [Hz]; the paper's f_c, above ten natural frequencies. The
     torque does not pass it, so whatever it takes off the motion biases the estimates: leave room above the motion."""
     position_order: int = 8
+    """Order of that low-pass, which runs forward and backward."""
     decimation_cutoff: float | None = None
     """Low-pass of the torque and of every column of the regressor [Hz]; the paper's f_cd, above two natural
     frequencies."""
     decimation_order: int = 4
+    """Order of that low-pass."""
     high_pass: float | None = None
     """High-pass of the torque and of every column [Hz], which takes slow drift out of both sides."""
     high_pass_order: int = 2
+    """Order of that high-pass."""
     decimate: int | None = None
     """Keep every n-th sample after the filters; by default five samples per period of `decimation_cutoff`."""
     mode: str = "once"

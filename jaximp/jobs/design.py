@@ -22,30 +22,32 @@ class DesignSettings:
     """What motion is wanted; see `excitation.design_excitation`."""
 
     harmonics: int = 5
-    """The highest frequency is harmonics / period."""
+    """Harmonics of the Fourier series: its highest frequency is harmonics / period."""
     period: float = 10.0
-    """[s]."""
+    """The motion repeats after this time [s]."""
     objective: str = "condition"
     """`condition`, `determinant`, `sigma_min`, or `stderr` of one parameter."""
     parameter: str | None = None
-    """Whose standard error."""
+    """The parameter whose standard error is made small, with `objective = "stderr"`."""
     window: float | None = None
     """Design for the worst sliding window of this length [s], not for the whole period."""
     rest: bool = False
-    """Begin and end at rest."""
+    """The motion begins and ends at rest."""
     mean: float | list[float] | None = None
     """Mean position [rad or m], for all joints or for each; free where it is not given."""
     sample_rate: float = 1000.0
-    """Of the controller, and of the exported motion [Hz]."""
+    """Sample rate of the controller, and of the exported motion [Hz]."""
     identify: str | None = None
     """Where the model has both: `human` if the robot is known by then (methods 1 and 3), or `robot`; else both. The
     torque is that of both in any case, and so are the parameters."""
     joints: int = 1
-    """Joints side by side."""
+    """How many joints of this model stand side by side."""
     starts: int = 32
-    """Random motions to begin with."""
+    """How many random motions the optimiser starts from."""
     seed: int = 0
+    """Seed of the random motions."""
     method: str = "bfgs"
+    """The optimiser: `bfgs`, `conjugate_gradient`, `lbfgsb` or `projected_gradient`."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,11 @@ class EncoderSettings:
     """See `excitation.Encoder`."""
 
     step: float
+    """Quantisation step [rad or m]."""
     cutoff: float
+    """Low-pass of the position before it is differentiated [Hz]."""
     order: int = 8
+    """Order of that low-pass."""
 
 
 @dataclass(frozen=True)

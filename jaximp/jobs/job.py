@@ -36,12 +36,19 @@ class RobotSettings:
     """Columns of `models.RobotJoint`."""
 
     gear_ratio: float = 1.0
+    """Motor turns per joint turn, where position and torque stay on the motor's side."""
     gravity: bool | None = None
+    """Columns of gravity (sine and cosine of the angle); by default they are there for a revolute joint."""
     viscous: bool = True
+    """A column of viscous friction."""
     coulomb: bool = True
+    """A column of Coulomb friction."""
     inertia: bool = True
+    """A column of inertia."""
     offset: bool = False
+    """A column of a constant torque."""
     g: float = 9.81
+    """Acceleration of gravity [m/s^2]."""
 
     def make(self, sample_rate: float | None = None, joint: str = "revolute") -> RobotJoint:
         """The model; it does not depend on the sample rate."""
@@ -57,8 +64,8 @@ class ReflexSettings:
     last: float = 0.49
     """Longest lag [s], by which the reflex should have ended."""
     count: int = 31
-    """How many. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart; twice as far
-    apart they miss what is between, and every estimate is biased."""
+    """How many lags there are. Much closer than half a period of `filter.decimation_cutoff` they cannot be told apart;
+    twice as far apart they miss what is between, and every estimate is biased."""
     direction: int = 1
     """1 where a velocity above zero stretches the muscle, else -1."""
 
@@ -75,9 +82,11 @@ class HumanSettings:
     """Columns of `models.HumanJoint`."""
 
     offset: bool = True
+    """A column of the offset torque, which is minus the stiffness times the equilibrium angle."""
     gear_ratio: float = 1.0
+    """Motor turns per joint turn, where position and torque stay on the motor's side."""
     reflex: bool | ReflexSettings = False
-    """`true`, or a table with some of the settings: the stretch reflex."""
+    """The stretch reflex: `true`, or a table with some of its settings."""
 
     def make(self, sample_rate: float | None = None, joint: str = "revolute") -> HumanJoint:
         """The model, for recordings of a sample rate [Hz], which only a reflex needs."""
@@ -100,17 +109,23 @@ class ArmSettings:
     equilibrium: list[float] | None = None
     """Two angles [rad]; damping and stiffness about them are identified where it is given."""
     inertia: bool = True
+    """Columns of the three base inertial parameters."""
     gravity: bool = False
+    """Columns of gravity: the arm does not move in a horizontal plane."""
     viscous: bool = False
+    """A column of viscous friction for each joint."""
     coulomb: bool = False
+    """A column of Coulomb friction for each joint."""
     offset: bool = False
+    """A column of a constant torque for each joint."""
     rotor: bool = False
-    """The inertia of the second motor's rotor behind its gear."""
+    """A column of the inertia of the second motor's rotor behind its gear, which counts on its own joint alone."""
     g: float = 9.81
+    """Acceleration of gravity [m/s^2]."""
     zero: str = "horizontal"
     """Where gravity acts: at angles of zero the arm is `horizontal`, or `hanging`."""
     length: float | None = None
-    """Of the upper arm [m]: ties inertia to gravity."""
+    """Length of the upper arm [m], if it is known: it ties the inertia to the gravity."""
 
     def make(self) -> PlanarArm:
         """The model."""
@@ -128,7 +143,8 @@ class ModelSettings:
     hand_arm: HandArmSettings | None = None
     """`[model.arm]` of a job with `[trials]`."""
     methods: tuple[int, ...] = (1,)
-    """With a robot and a human: the methods of III-C. The first makes the report, the others stand beside it."""
+    """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
+    beside it."""
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,11 @@ from jaximp.types import Recording, nearest
 TASKS = ("movement", "posture")
 """What the subject does: move and be perturbed at times, or keep a posture."""
 STATIC_WINDOW = 0.4
-"""After the onset of a perturbed posture, from which the inertia is estimated [s]."""
+"""Time after the onset of a perturbed posture from which the inertia is estimated [s]."""
 _POSTURE = ("files", "file", "trial", "onset", "window")
 """Keys of `[trials.posture]` beside the columns."""
 _ASKED = ("command", "reference")
-"""Columns of which a table has its own, or another table's."""
+"""Columns that say what was asked for: `[trials.posture]` names its own, or takes that of `[trials]`."""
 _FIXED = ("joint", "gear_ratio", "name", "force")
 """Keys of `load_recording` that have no meaning for a hand in a plane."""
 
@@ -55,11 +55,11 @@ class HandleSettings:
     """`[trials.handle]`: the admittance of the handle, as in `Handle`."""
 
     mass: list[float]
-    """Along both axes [kg]."""
+    """Mass that the admittance simulates along both axes [kg]."""
     damping: list[float]
-    """[N s/m]"""
+    """Its damping along both axes [N s/m]."""
     own_mass: float = 0.0
-    """Between force sensor and hand [kg]."""
+    """Mass between force sensor and hand [kg]."""
 
     def make(self) -> Handle:
         return Handle(tuple(self.mass), tuple(self.damping), self.own_mass)
@@ -70,9 +70,9 @@ class TriggerSettings:
     """`[trials.trigger]`: the place at which perturbations begin."""
 
     axis: int
-    """1 or 2."""
+    """The axis along which the hand passes that place: 1 or 2."""
     position: float
-    """[m]"""
+    """Where the hand was on that axis when perturbations began [m]."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class HandArmSettings:
     """`[model.arm]` beside `[trials]`: the arm whose hand was recorded."""
 
     lengths: list[float]
-    """Of upper arm and forearm [m]."""
+    """Lengths of upper arm and forearm [m]."""
     elbow: str = "right"
-    """See `ArmGeometry`."""
+    """On which side the elbow lies, seen from the shoulder along the line to the hand: `right` or `left`."""
     shoulder: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    """Where it is in the frame of the hand's position [m]."""
+    """Where the shoulder is in the frame of the hand's position [m]."""
     inertia: list[float] | None = None
     """Base inertial parameters of Börner et al. 2020, eq. (12): `I_1 + m_2 l1^2, I_2, m_2 c_2 l1` [kg m^2]."""
     inertia_stderr: list[float] | None = None
@@ -99,24 +99,27 @@ class TrialsSettings:
     """`[trials]`."""
 
     task: str = "movement"
-    """One of `TASKS`."""
+    """What the subject does: `movement`, or `posture` for postures that are kept and perturbed."""
     method: str | list[str] = "output_error"
-    """One of `isolation.METHODS`, or several: the first makes the report, the others stand beside it."""
+    """`output_error`, `feedback_jerk`, `gomi_kawato` or `erden_billard`, or a list of several: the first makes the
+    report, the others stand beside it."""
     window: float = VOLUNTARY_DELAY
-    """After the onset, from which impedance is estimated [s]."""
+    """Time after the onset from which the impedance is estimated [s]."""
     cutoff: list[float] | None = None
-    """[Hz] two, for `feedback_jerk` without unperturbed trials."""
+    """Cut-off frequencies along both axes [Hz], which `feedback_jerk` needs where there are no unperturbed trials."""
     onset: float | list[float] | None = None
-    """Of the perturbation [s], in each trial's own time; `nan` for an unperturbed one. Else found in the command."""
+    """When the perturbation begins [s], in each trial's own time; `nan` for an unperturbed trial. By default it is
+    found in the command."""
     trigger: TriggerSettings | None = None
+    """The place at which perturbations begin, by which unperturbed trials are aligned; by default it is found."""
     handle: HandleSettings | None = None
-    """Some methods must know it."""
+    """The admittance of the handle, which `output_error` and `feedback_jerk` must know."""
     files: str | list[str] | None = None
     """One file a trial: a name, a pattern, a folder, or a list of these."""
     file: str | None = None
-    """All trials in one file,"""
+    """The file that holds all trials, in place of `files`."""
     trial: str = "trial"
-    """told apart by this column."""
+    """The column of `file` that tells the trials apart."""
     mapping: Mapping[str, Any] = field(default_factory=dict)
     """Columns: keywords of `load_recording`."""
     geometry: ArmGeometry | None = None

@@ -28,7 +28,7 @@ from jaxtyping import Num, Shaped
 from jaximp.types import AnyArray, Numbers
 
 NEGLIGIBLE = 1e-6
-"""Share of the largest spectral density below which noise says nothing that can be believed."""
+"""Below this share of the largest spectral density, the noise cannot be relied on."""
 RIDGE = 1e-8
 """Share of the largest spectral density that is added to all of it, so that the Cholesky factor exists."""
 ROUNDING = 1e-14
@@ -43,9 +43,9 @@ PIECE, OVERLAP = 6, 4
 """Of long records: rows that are whitened at a time, and rows before them that count as their past, both in bands of
 the covariance. With a high-pass of 0.3 Hz this moves estimates by 0.0005 standard errors."""
 SIGNIFICANCE = 0.01
-"""Residuals whose whiteness is less likely than this are given an autoregression."""
+"""Residuals get an autoregression where a test gives their whiteness a smaller probability than this."""
 LAGS = 20
-"""Lags that are tested for whiteness, and at most a fifth of the rows."""
+"""How many lags are tested for whiteness; never more than a fifth of the rows."""
 ATTENUATION = 0.25
 """Noise in the regressor is corrected for where it moves an estimate by this many standard errors: 95 % intervals then
 hold the truth in 94.3 % of all cases."""
@@ -56,13 +56,14 @@ PLAIN = np.ones(1)
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """What is known of the noise of rows, up to its scale."""
+    """What is known of the noise in the rows, except its scale."""
 
     autocovariance: Numbers = field(default_factory=lambda: PLAIN)
-    """(L,) by lag, in rows, as `signals.autocovariance` makes it of the filters; a single one if the rows are white."""
+    """(L,) autocovariance by lag, in rows, as `signals.autocovariance` computes it from the filters; a single one for
+    rows that are white."""
     autoregression: tuple[Numbers, ...] = ()
-    """For each output the coefficients (k,) by which the rows that the filters made of it followed from those before:
-    what went through the filters was not white. None if it was."""
+    """For each output the coefficients (k,) of an autoregression, where the noise before the filters was not white.
+    Empty: the noise was white."""
 
     def __post_init__(self) -> None:
         r = np.asarray(self.autocovariance, float)
@@ -75,7 +76,7 @@ class Noise:
 
     @property
     def every(self) -> int:
-        """Every so-manieth row is kept."""
+        """Keep every n-th row: this is n."""
         density = _density(self.autocovariance)
         edge = np.flatnonzero(density >= NEGLIGIBLE * density.max())[-1]
         return max(1, (len(density) - 1) // max(1, int(edge)))
@@ -102,9 +103,9 @@ class WhiteRows:
     y: Numbers
     """(R, n), zero where `valid` is False. The scale of the noise is what one row of torque had [N m]."""
     valid: np.ndarray
-    """(R, n)"""
+    """(R, n) whether a row counts."""
     count: Numbers
-    """(n,) how many independent rows there are."""
+    """(n,) how many independent rows each output has."""
     size: Numbers
     """(R, n) by what the part of each row was divided that was new in it: the root of the noise's variance given the
     rows before, where that of a row by itself is one."""
@@ -121,7 +122,7 @@ class WhiteRows:
 
 
 def joined(parts: Sequence[WhiteRows]) -> WhiteRows:
-    """Rows of trials, or of other stretches whose noise is independent, as those of one."""
+    """Join the rows of trials, or of other stretches whose noise is independent."""
     if not parts:
         raise ValueError("there are no rows to join: pass at least one stretch")
     W, y, valid, size = (np.concatenate([getattr(one, name) for one in parts]) for name in ("W", "y", "valid", "size"))
@@ -255,11 +256,11 @@ def residuals(rows: WhiteRows, theta: Num[AnyArray, " p"]) -> Numbers:
 
 
 class Whiteness(NamedTuple):
-    """A test of Ljung and Box."""
+    """The result of a test of Ljung and Box."""
 
     statistic: float
     p: float
-    """Probability of a statistic this large in white noise."""
+    """The probability that white noise has a statistic as large as this one."""
     lags: int
 
 

@@ -26,7 +26,7 @@ from jaximp.models.joint import parameter_units, sine_and_cosine
 from jaximp.types import AnyArray
 
 LONGEST = 10.0
-"""No arm is longer [m]; a length beyond was given in other units."""
+"""No arm is longer [m]; a greater length was surely given in other units."""
 
 
 class PlanarArm(Model):
@@ -59,9 +59,9 @@ class PlanarArm(Model):
     g: float
     zero: str = eqx.field(static=True)
     length: float | None
-    """Of the upper arm [m], where it ties inertia to gravity."""
+    """Length of the upper arm [m], where it ties the inertia to the gravity."""
     width: Array | None
-    """(2,) velocity [rad/s] around which the sign of it changes, where it is smoothed."""
+    """(2,) velocity [rad/s] around which its sign changes gradually; None where the sign jumps."""
 
     def __init__(
         self,
@@ -160,13 +160,13 @@ class ArmLinks:
     """
 
     lengths: tuple[float, float]
-    """From joint to joint, and from the elbow to the hand [m]."""
+    """Lengths of the links [m]: from shoulder to elbow, and from elbow to hand."""
     masses: tuple[float, float]
-    """[kg]"""
+    """Masses of the links [kg]."""
     centres: tuple[float, float]
-    """From each link's own joint to its centre of mass, towards the next joint [m]."""
+    """Distance of each link's centre of mass from its own joint, towards the next joint [m]."""
     inertias: tuple[float, float]
-    """About each link's centre of mass [kg m^2]."""
+    """Moment of inertia of each link about its centre of mass [kg m^2]."""
 
     def __post_init__(self) -> None:
         two_numbers("lengths", self.lengths, lowest=0.0, above=True)

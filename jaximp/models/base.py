@@ -38,7 +38,7 @@ class Model(eqx.Module):
     """What each column is made of, such as `ddq` or `sin(q/15)`: equal text means equal numbers. Those in `MOTION` are
     the motion itself, and a constant."""
     label: str = eqx.field(static=True)
-    """What goes in front of the names when models are stacked, such as `robot`."""
+    """The prefix of the parameters' names when models are stacked, such as `robot`."""
     n_joints: int = eqx.field(static=True)
     """How many joints the regressor has rows for."""
 
@@ -49,12 +49,12 @@ class Model(eqx.Module):
 
     @property
     def memory(self) -> int:
-        """How many samples of the past a row needs; of a recording, so many rows at the beginning are not known."""
+        """How many samples of the past a row needs. As many rows at the beginning of a recording are not known."""
         return 0
 
     @property
     def sample_rate(self) -> float | None:
-        """Of the recordings that a model with memory is made for [Hz]; None without memory."""
+        """Sample rate of the recordings that a model with memory is made for [Hz]; None without memory."""
         return None
 
     def sampled_at(self, sample_rate: float) -> Model:
@@ -329,5 +329,7 @@ def _shared_rate(*models: Model) -> float | None:
 
 def _check_joints(first: Model, second: Model) -> None:
     if first.n_joints != second.n_joints:
-        raise ValueError(f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked")
+        raise ValueError(
+            f"models of {first.n_joints} and {second.n_joints} joints cannot be stacked: give both the same"
+        )
     _shared_rate(first, second)

@@ -61,14 +61,14 @@ def endpoint_stiffness(
 
 
 class EndpointImpedance(eqx.Module):
-    """What the hand resists with."""
+    """Inertia, damping and stiffness with which the hand resists a motion."""
 
     inertia: Float[Array, "*N 2 2"]
-    """[kg]"""
+    """Inertia at the hand [kg]."""
     damping: Float[Array, "*N 2 2"]
-    """[N s/m]"""
+    """Damping at the hand [N s/m]."""
     stiffness: Float[Array, "*N 2 2"]
-    """[N/m]"""
+    """Stiffness at the hand [N/m]."""
 
 
 def endpoint_impedance(
@@ -92,9 +92,9 @@ class Ellipse(eqx.Module):
     """
 
     major: Float[Array, "*N"]
-    """Larger half axis."""
+    """Length of the larger half axis."""
     minor: Float[Array, "*N"]
-    """Smaller half axis."""
+    """Length of the smaller half axis."""
     orientation: Float[Array, "*N"]
     """Angle [rad] of the major axis from the x axis, within a quarter turn of it."""
     size: Float[Array, "*N"]
@@ -103,7 +103,7 @@ class Ellipse(eqx.Module):
     """Major over minor axis, at least one."""
 
     def outline(self, n: int = 200) -> Float[Array, "*N n 2"]:
-        """Points all around, the last at the first."""
+        """Points around the ellipse; the last one is the first one again."""
         turn = jnp.linspace(0, 2 * jnp.pi, n)
         along, across = self.major[..., None] * jnp.cos(turn), self.minor[..., None] * jnp.sin(turn)
         cosine, sine = jnp.cos(self.orientation)[..., None], jnp.sin(self.orientation)[..., None]

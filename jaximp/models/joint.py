@@ -145,7 +145,7 @@ class RobotJoint(Model):
     g: float
     joint: str = eqx.field(static=True)
     width: Array | None
-    """Velocity [rad/s or m/s] around which the sign of it changes, where it is smoothed."""
+    """Velocity [rad/s or m/s] around which its sign changes gradually; None where the sign jumps."""
 
     def __init__(
         self,

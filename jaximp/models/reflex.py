@@ -20,10 +20,11 @@ from jaximp.models.base import Model
 from jaximp.types import AnyArray
 
 LAGS = tuple(round(0.040 + 0.015 * k, 3) for k in range(31))
-"""From 40 to 490 ms [s]. Closer together than half a period of the low-pass, lags cannot be told apart; a last lag at
-which the weights have not come to zero leaves torque to the stiffness (experiments/reflex.py)."""
+"""The lags that are used by default [s]: 40 to 490 ms. Lags that are closer together than half a period of the low-pass
+cannot be told apart. If the weights have not come to zero at the last lag, part of the reflex's torque is taken for
+stiffness (experiments/reflex.py)."""
 LONGEST = 5.0
-"""No reflex lasts longer [s]; a lag beyond was given in milliseconds."""
+"""No reflex lasts longer [s]; a greater lag was surely given in milliseconds."""
 
 
 class ReflexPathway(Model):
@@ -44,7 +45,7 @@ class ReflexPathway(Model):
     """
 
     lags: tuple[float, ...] = eqx.field(static=True)
-    """Behind the velocity [s]."""
+    """How far each lag is behind the velocity [s]."""
     rate: float = eqx.field(static=True)
     direction: int = eqx.field(static=True)
 
@@ -99,7 +100,7 @@ class ReflexPathway(Model):
         return jnp.maximum(self.direction * jnp.stack(velocity, axis=-1), 0)
 
     def _shifts(self) -> list[tuple[int, float]]:
-        """Every lag in samples: whole ones, and what is left."""
+        """Every lag in samples: the whole samples, and the fraction that is left."""
         found = []
         for lag in self.lags:
             samples = lag * self.rate
@@ -122,15 +123,16 @@ def _checked(lags: Sequence[float] | AnyArray) -> tuple[float, ...]:
 
 
 class ReflexGain(eqx.Module):
-    """A reflex in two numbers, of one estimate or of M."""
+    """A reflex in two numbers, gain and delay, for one estimate or for M of them."""
 
     gain: Float[AnyArray, "*M"]
-    """Torque for a lasting stretch of one radian a second [N m s/rad]; above zero where it resists the stretch."""
+    """Gain: torque for a lasting stretch of one radian a second [N m s/rad]; above zero where it resists the
+    stretch."""
     gain_stderr: Float[AnyArray, "*M"]
     delay: Float[AnyArray, "*M"]
-    """Mean lag, weighted by what each lag contributes [s]."""
+    """Delay: the mean lag, weighted by what each lag contributes [s]."""
     delay_stderr: Float[AnyArray, "*M"]
-    """Of first order: where the gain is not well above zero it says little."""
+    """Standard error of the delay, to first order; it says little where the gain is not well above zero."""
 
 
 def reflex_gain(model: Model, theta: Num[AnyArray, "*M p"], covariance: Num[AnyArray, "*M p p"]) -> ReflexGain:

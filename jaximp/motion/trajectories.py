@@ -22,7 +22,7 @@ Motion = tuple[Float[Array, "*out"], Float[Array, "*out"], Float[Array, "*out"]]
 """Position [rad], velocity [rad/s] and acceleration [rad/s^2], each (*t, *n)."""
 
 Trajectory = Callable[[Array], tuple[Array, Array, Array]]
-"""What the modules below are, once made."""
+"""The type of every trajectory: a function of time that returns position, velocity and acceleration."""
 
 
 def array_field(**options: Any) -> Any:
@@ -116,10 +116,10 @@ _QUINTIC = np.array(
         [-6, -3, -0.5, 6, -3, 0.5],
     ]
 )
-"""Coefficients of u^0 .. u^5 from them."""
+"""The matrix that makes the coefficients of u^0 .. u^5 from these six numbers."""
 
 _SQUARED_JERK = _QUINTIC[3:].T @ np.array([[36, 72, 120], [72, 192, 360], [120, 360, 720]]) @ _QUINTIC[3:]
-"""Its integral from u = 0 to 1, as a quadratic form of them."""
+"""The integral of the squared jerk from u = 0 to 1, as a quadratic form of these six numbers."""
 
 
 class MinimumJerk(eqx.Module):
@@ -179,7 +179,7 @@ class SixthOrder(eqx.Module):
     end: Float[Any, "*n"] = array_field()
     """(*n) position from t = duration on [rad]."""
     duration: Float[Any, ""] = array_field()
-    """[s]."""
+    """Duration of the motion [s]."""
 
     def __check_init__(self) -> None:
         if self.start.shape != self.end.shape:
@@ -209,7 +209,7 @@ class RaisedSine(eqx.Module):
     amplitude: Float[Any, "*n"] = array_field()
     """(*n) first peak of the acceleration, A_p,1 [m/s^2]."""
     duration: Float[Any, ""] = array_field()
-    """Of the first profile, T_p,1 [s]."""
+    """Duration of the first profile, T_p,1 [s]."""
     ratio: Float[Any, ""] = array_field(default=1.5)
     """Duration of the second profile over that of the first."""
 

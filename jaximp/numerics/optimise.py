@@ -29,7 +29,7 @@ METHODS = {
 
 
 class Found(NamedTuple):
-    """Where each start has led."""
+    """The minimum that each start has led to."""
 
     x: Float[Array, "m d"]
     value: Float[Array, " m"]
@@ -112,7 +112,8 @@ def onto_polytope(A: Float[Array, "k d"], b: Float[Array, " k"]) -> Projection:
 
 
 def _imported_jaxopt() -> ModuleType:
-    """It warns that it is no longer maintained, which is known here."""
+    """jaxopt warns on import that it is no longer maintained; this is known here, and the warning is kept from the
+    user."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt

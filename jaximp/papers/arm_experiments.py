@@ -31,7 +31,7 @@ from jaximp.types import AnyArray, Numbers
 
 QUANTITIES = ("position", "velocity", "acceleration", "force")
 GROUP = 20
-"""Trials that one estimate is made of."""
+"""How many trials one estimate is made of."""
 LINKS = ArmLinks((0.29, 0.34), (1.93, 1.52), (0.165, 0.19), (0.0141, 0.0188))
 """Upper arm and forearm of the simulated subject: they have the base inertial parameters that the paper prints."""
 HEIGHT, WEIGHT = (1.7483, 0.0738), (69.43, 9.82)
@@ -42,11 +42,11 @@ class Case(NamedTuple):
     """One configuration of the simulation; the defaults are the original one."""
 
     duration: float = 2.0
-    """T_mov [s]."""
+    """Duration of a movement, T_mov [s]."""
     cutoff: float = 2.0
-    """Of the neural noise, f_c,N [Hz]."""
+    """Cut-off of the neural noise, f_c,N [Hz]."""
     amplitude: Any = 12.5
-    """Of the neural noise, alpha_N."""
+    """Amplitude of the neural noise, alpha_N."""
 
 
 class Experiment(eqx.Module):
@@ -118,7 +118,7 @@ def _simulate(
 
 
 def true_deviations(experiment: Experiment, window: float = VOLUNTARY_DELAY) -> Deviations:
-    """Of the twins from the perturbed trials."""
+    """Differences between the perturbed trials and their unperturbed twins."""
     samples = round(window * RATE) + 1
     with_it, without = (in_window(m, samples) for m in (experiment.perturbed, experiment.twins))
     return Deviations(
@@ -217,5 +217,5 @@ def subject(seed: int) -> NeuromuscularArm:
 
 
 def _spread(random: np.random.Generator, of: tuple[float, float]) -> float:
-    """A normal number over its mean, within 1.5 standard deviations."""
+    """A random number over its mean: normally distributed, but within 1.5 standard deviations."""
     return 1 + float(np.clip(random.normal(), -1.5, 1.5)) * of[1] / of[0]

@@ -66,7 +66,7 @@ SUBJECTS = 12
 WINDOWS = np.arange(40, 180, 15) / 1000
 """Lengths of the window that figure 12 compares [s]."""
 STATIC_WINDOWS = np.arange(100, 500, 50) / 1000
-"""And those of the static task [s]."""
+"""Lengths of the window of the static task that figure 12 compares [s]."""
 AT_ONCE = 5
 """Simulations in one call; all ten need 3 GB of memory at 3 s."""
 SHOWN = ("D11", "D12", "D21", "D22", "K11", "K12", "K22")
@@ -102,12 +102,12 @@ PAPER: dict[str, Any] = {
 
 
 class Errors(NamedTuple):
-    """What a method makes of one experiment."""
+    """Errors of one method in one experiment."""
 
     nrmse: Numbers
     """(4, T, S) normalised errors of the deviations at each sample, eq. (42) [%]."""
     cutoff: Numbers
-    """(2,) of the high-pass [Hz]; NaN where there was none."""
+    """(2,) cut-off of the high-pass [Hz]; NaN where there was none."""
     inertia: Numbers
     """(3,) normalised absolute errors [%]."""
     impedance: Numbers
@@ -331,7 +331,7 @@ def _tables(original: dict[str, list[Errors]], swept: dict[str, Any], builds: li
 
 
 def _orderings(parts: dict[str, Any]) -> list[dict[str, Any]]:
-    """Who is better in each cell of tables 1 B to D, here and in the paper."""
+    """Which method is better in each cell of tables 1 B to D, here and in the paper."""
     found = []
     for name, cases in parts.items():
         for value in _tabulated(name, cases):
@@ -381,7 +381,7 @@ CALIBRATED = {
     "onset of the static task": "1 s after the noise sets in: a choice",
     "sample rate": "4 kHz: from BIC less AIC in Table 2B",
 }
-"""What the paper does not print."""
+"""What the paper does not print, and how it was chosen here."""
 WHY = (
     "Every constant that the paper does not print is listed above; with them its numbers are met within what ten "
     "simulations differ by, but for those below.",
@@ -397,7 +397,7 @@ WHY = (
 
 
 def _markdown(tables: dict[str, Any]) -> str:
-    """The tables for people."""
+    """The tables as Markdown."""
     cell = "{:.2f} ({:.2f})".format
     head = "| NRMSE, %: mean (SD) | position | velocity | acceleration | force |"
     lines = [head, "| --- " * 5 + "|"]

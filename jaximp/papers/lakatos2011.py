@@ -37,9 +37,9 @@ RATE = 1000.0  # Hz
 DURATIONS = np.arange(5, 41) / 100
 """T_k [s]. The paper ends at 0.3, and yet speaks of observations above 0.4."""
 OBSERVED = 0.07
-"""Longer than the movement the observation is [s]."""
+"""By how much the observation is longer than the movement [s]."""
 BEFORE, AFTER = 0.15, 0.57
-"""Kept around the onset [s]."""
+"""Time that is kept before and after the onset [s]."""
 REPEATS = 5
 HELD_OUT = 29
 FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0)
@@ -55,7 +55,7 @@ NOMINAL = (1, 1, 2, 0)
 SAME = 0.1
 """An estimate is quasi-constant where all of it is within this share of its matrix's norm of the longest window's."""
 LIMITS = TrustLimits(min_vaf=0.9, max_asymmetry=0.05, max_relative_stderr=0.1)
-"""What the held-out torque, the antisymmetric part and the standard errors must keep here."""
+"""The limits that the held-out torque, the antisymmetric part and the standard errors must keep here."""
 TABULATED = (0.05, 0.1, 0.2, 0.3)
 """T_k of which Table I is printed [s]."""
 WAY_POINTS = 4
@@ -76,7 +76,7 @@ class Estimate(NamedTuple):
     """One set of parameters; leading axes: cuff, noise, gain, seed, duration."""
 
     fit: Any
-    """A `WindowFit`."""
+    """The estimate, a `WindowFit`."""
     held_out_vaf: Any
     predicted: Any
     """(N, 2) torque of the held-out trial [N m]."""
@@ -87,7 +87,7 @@ class Outcome(NamedTuple):
 
     full: Estimate
     reduced: Estimate
-    """With the base inertial parameters known."""
+    """The estimate where the base inertial parameters are known."""
     measured: Any
     """(N, 2) filtered torque of the held-out trial [N m]."""
     damping: Any
@@ -198,7 +198,7 @@ def met(outcome: Outcome, which: str) -> dict[str, NDArray[np.bool_]]:
 
 
 def _as_at_the_end(theta: Numbers) -> NDArray[np.bool_]:
-    """Within a share of the estimate of the longest observation."""
+    """Whether an estimate is within a share of that of the longest observation."""
     last = theta[..., -1:, :]
     return np.linalg.norm(theta - last, axis=-1) < SAME * np.linalg.norm(last, axis=-1)
 
@@ -442,7 +442,7 @@ WHY = (
 
 
 def _markdown(tables: dict[str, Any]) -> str:
-    """The tables for people."""
+    """The tables as Markdown."""
     paper = PAPER["thresholds_ms"]
     theirs = {
         ("full", "stiffness positive definite"): paper["positive definite"],

@@ -299,7 +299,7 @@ def _save(folder: Path, name: str, figure: Any) -> None:
 
 
 def _markdown(tables: dict[str, Any]) -> str:
-    """The tables for people."""
+    """The tables as Markdown."""
     paper, measured = tables["paper"], tables["measured"]
     lines = ["| | paper | here |", "| --- | --- | --- |"]
 

@@ -31,9 +31,9 @@ from jaximp.posterior.priors import Prior, make_prior
 from jaximp.types import AnyArray, Numbers
 
 FLAT = 1e-12
-"""A direction is flat whose information, in units in which every parameter has one, is below this."""
+"""A direction is flat if its information is below this, in units in which the information of every parameter is one."""
 NO_NOISE = 1e-12
-"""Residuals that are this share of the torque are rounding."""
+"""Residuals that are smaller than this share of the torque are taken as rounding."""
 STEPS, DECREMENT = 60, 1e-14
 """Of Newton's method: how many at most, and the squared distance from the mode, in standard deviations, at its end."""
 STIFFNESS = tuple(name for name in ELEMENTS if name != "K21")
@@ -41,14 +41,14 @@ FACTOR = ("l11", "l21", "l22")
 UNITS = ("N m s/rad",) * 4 + ("N m/rad",) * 3
 FACTOR_UNITS = ("N m s/rad",) * 4 + ("(N m/rad)^0.5",) * 3
 K = slice(4, 7)
-"""Where a stiffness is among the parameters."""
+"""The parameters of a stiffness among all elements."""
 
 
 class GaussianRows(eqx.Module):
     """Torques with Gaussian noise, from the triangles of their rows."""
 
     rows: Float[AnyArray, "*M n k q"]
-    """Of n outputs: rows `[W y]`, or as well their triangle."""
+    """For each of n outputs the rows `[W y]`, or the triangle of their QR decomposition."""
     count: Float[AnyArray, "*M n"]
     """How many independent rows each output has."""
 
@@ -67,7 +67,7 @@ class HeavyRows(eqx.Module):
     """Torques whose noise has heavy tails: Student's t, of a scale that is unknown."""
 
     rows: Float[AnyArray, "*M n k q"]
-    """Of n outputs: rows `[W y]`."""
+    """For each of n outputs the rows `[W y]`."""
     valid: Shaped[AnyArray, "*M n k"]
     count: Float[AnyArray, "*M n"]
     nu: Float[AnyArray, "*M"]
@@ -83,11 +83,11 @@ class HeavyRows(eqx.Module):
 
 
 class StudentEstimate(eqx.Module):
-    """What an estimate with standard errors says: multivariate Student's t around it."""
+    """The likelihood of an estimate with standard errors: a multivariate Student's t around it."""
 
     mean: Float[AnyArray, "*M p"]
     root: Float[AnyArray, "*M p p"]
-    """The inverse of the covariance is root' root."""
+    """A root of the precision: root' root is the inverse of the covariance."""
     dof: Float[AnyArray, "*M"]
 
     def log_likelihood(self, x: Float[Array, " p"]) -> Float[Array, ""]:
@@ -119,9 +119,9 @@ class Density(eqx.Module):
     """Log density of parameters: a likelihood and a prior; the place of a stiffness K may be taken by its factor."""
 
     likelihood: Any
-    """Of the elements: `GaussianRows`, `HeavyRows`, `StudentEstimate` or `Curved`."""
+    """The likelihood of the elements: `GaussianRows`, `HeavyRows`, `StudentEstimate` or `Curved`."""
     prior: Prior
-    """Of the elements."""
+    """The prior of the elements."""
     names: tuple[str, ...] = eqx.field(static=True)
     """Of the parameters; K = L L' has l11, l21 and l22, of which the first and the last are positive."""
     units: tuple[str, ...] = eqx.field(static=True)
@@ -130,7 +130,7 @@ class Density(eqx.Module):
 
     @property
     def element_names(self) -> tuple[str, ...]:
-        """As `names`, with K in place of its factor."""
+        """The names with the elements of K in place of those of its factor."""
         return self.prior.names
 
     @property
@@ -161,7 +161,7 @@ class Density(eqx.Module):
         return _laplace(self)
 
     def start(self) -> Float[Array, " P"]:
-        """Parameters inside the support, near the mode."""
+        """Parameters that lie inside the support, near the mode."""
         x = self.likelihood.guess()
         logarithmic = np.array(self.prior.logarithmic)
         x = jnp.where(logarithmic & (x <= 0), jnp.exp(jnp.where(logarithmic, self.prior.mean, 0)), x)
@@ -296,7 +296,7 @@ def estimate_density(
     names, covariance = tuple(names), np.asarray(covariance, float)
     root = _inverse_root(covariance, "the estimate")
     if not (np.isfinite(np.asarray(theta)).all() and 0 < float(dof) < np.inf):
-        raise ValueError("the estimate or its degrees of freedom are not finite: there must be an estimate")
+        raise ValueError("there is no estimate to draw around: its numbers, or its degrees of freedom, are not finite")
     likelihood = StudentEstimate(np.asarray(theta, float), root, np.asarray(dof, float))
     prior = _prior_for(prior, names)
     if names != STIFFNESS:
@@ -448,7 +448,7 @@ def _element_columns(R: Array) -> Array:
 def _prior_for(prior: Prior | None, names: tuple[str, ...]) -> Prior:
     prior = make_prior(names) if prior is None else prior
     if prior.names != names:
-        raise ValueError(f"the prior is one of {', '.join(prior.names)}: it must be one of {', '.join(names)}")
+        raise ValueError(f"the prior is for {', '.join(prior.names)}: make it for {', '.join(names)}")
     return prior
 
 

@@ -22,38 +22,38 @@ from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Numbers, nearest
 
 RHAT_MOST = 1.05
-"""Of chains that have converged. Vehtari et al. ask for 1.01 from a few long chains; a walker of an ensemble of fifty
-autocorrelation times has 1.02 for its length alone."""
+"""Largest R-hat of chains that have converged. Vehtari et al. ask for 1.01 from a few long chains; an ensemble whose
+walkers are fifty autocorrelation times long has 1.02 for its length alone."""
 ESS_LEAST = 400
-"""Effective samples, of the bulk and of the tails, below which neither an interval nor R-hat means much (Vehtari)."""
+"""With fewer effective samples, of the bulk or of the tails, neither an interval nor R-hat means much (Vehtari)."""
 ACCEPTANCE_LEAST = 0.05
-"""Accepted share of the proposals; with fewer the proposals do not fit the posterior."""
+"""Smallest share of accepted proposals; below it the proposals do not fit the posterior."""
 CORRELATED = 0.99
-"""Parameters of a larger correlation are named as a likely reason where sampling failed."""
+"""Where sampling failed, pairs of parameters with a larger correlation are named as a likely reason."""
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 CHUNK = 2_000_000
-"""Numbers that are diagnosed at a time, so that they need little memory."""
+"""How many numbers are diagnosed at a time, so that diagnosing needs little memory."""
 
 
 class Posterior(eqx.Module):
     """Draws from a posterior by C chains (or walkers) of N draws each, with what says whether they can be trusted."""
 
     chains: Float[AnyArray, "C N p"]
-    """Parameters, in `units`."""
+    """Draws of the parameters, in `units`."""
     log_density: Float[AnyArray, "C N"]
-    """Of every draw, up to a constant."""
+    """Log density of every draw, up to a constant."""
     acceptance: Float[AnyArray, " C"]
     """Accepted share of each chain's proposals."""
     ess: Float[AnyArray, " p"]
-    """Effective samples of the bulk, as ArviZ has them."""
+    """Effective samples of the bulk, as ArviZ computes them."""
     ess_tail: Float[AnyArray, " p"]
-    """Effective samples of the 5 % and 95 % quantiles, the fewer of both."""
+    """Effective samples of the 5 % and 95 % quantiles: the smaller of the two numbers."""
     rhat: Float[AnyArray, " p"]
-    """Rank-normalised split R-hat: near one where every half of every chain tells the same."""
+    """Rank-normalised split R-hat: it is near one where all halves of all chains agree."""
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     sampler: str = eqx.field(static=True, default="")
-    """What drew them, and how, in words."""
+    """Which sampler made the draws, and how, in words."""
 
     @property
     def samples(self) -> Float[AnyArray, "draws p"]:
@@ -84,7 +84,7 @@ class Posterior(eqx.Module):
 
 
 class PosteriorMany(eqx.Module):
-    """Posteriors of M windows, each of its own; `posteriors[k]` is one of them. A window that failed is NaN."""
+    """The posteriors of M windows, one for each; `posteriors[k]` is that of window k. A window that failed is NaN."""
 
     chains: Float[AnyArray, "M C N p"]
     log_density: Float[AnyArray, "M C N"]
@@ -107,7 +107,7 @@ class PosteriorMany(eqx.Module):
 
     @property
     def why(self) -> list[str]:
-        """For each window why its draws cannot be trusted, as `Posterior.why`."""
+        """For each window, why its draws cannot be trusted, as in `Posterior.why`."""
         return [one.why for one in self]
 
     def __len__(self) -> int:
@@ -133,7 +133,7 @@ def make_posterior(
     acceptance: Float[AnyArray, " C"] | None = None,
     sampler: str = "",
 ) -> Posterior:
-    """A `Posterior` of chains from anywhere, with its diagnostics."""
+    """Make a `Posterior` from chains of any sampler, and compute its diagnostics."""
     chains = np.asarray(chains)
     names, units = labels(None, chains.shape[-1], names, units)
     ess, ess_tail, rhat = diagnose(chains)
@@ -152,7 +152,7 @@ def make_posterior(
 
 
 def stacked(posteriors: Sequence[Posterior]) -> PosteriorMany:
-    """Posteriors of the same parameters, with as many draws each, as those of windows."""
+    """Stack posteriors of the same parameters, with equally many draws each, into one `PosteriorMany`."""
     first = posteriors[0]
     fields = [name for name in Posterior.__dataclass_fields__ if name not in SHARED]
     arrays = {name: np.stack([np.asarray(getattr(one, name)) for one in posteriors]) for name in fields}
@@ -332,10 +332,10 @@ class ExactPosterior(eqx.Module):
     """
 
     R: Float[AnyArray, "k k"]
-    """Upper triangle of the columns of the k = p - 1 parameters."""
+    """Upper triangle of the QR decomposition, for the columns of the k = p - 1 parameters."""
     location: Float[AnyArray, " k"]
     scale: Float[AnyArray, ""]
-    """Root of the residual sum of squares over `dof` [N m]."""
+    """The square root of the residual sum of squares over `dof` [N m]."""
     dof: Float[AnyArray, ""]
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
@@ -374,7 +374,7 @@ class ExactPosterior(eqx.Module):
         return np.append(middle - half, ends[0]), np.append(middle + half, ends[1])
 
     def samples(self, key: PRNGKeyArray, n: int) -> Float[Array, "n p"]:
-        """Independent draws."""
+        """Draw independent samples."""
         return _draw_exact(self, key, n)
 
     def posterior(self, key: PRNGKeyArray, n: int = 4000) -> Posterior:
@@ -504,7 +504,7 @@ def probability_greater(
 
 
 def _share_below(of: Numbers, than: Numbers) -> Numbers:
-    """For each number of `than` the share of `of` below it; of those that are equal the half."""
+    """For each number of `than`: the share of `of` that is smaller, where equal numbers count half."""
     ordered = np.sort(of, axis=None)
     counts = np.searchsorted(ordered, than, "left") + np.searchsorted(ordered, than, "right")
     return counts / (2 * ordered.size)

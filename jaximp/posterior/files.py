@@ -20,11 +20,13 @@ from jaximp.posterior.draws import Posterior, PosteriorMany
 from jaximp.types import AnyArray, Numbers
 
 GROUP = "mcmc"
-"""Where emcee looks for a chain."""
+"""The group of the HDF5 file in which emcee looks for a chain."""
 SAME = 1e-8
-"""Relative: two log densities that agree so well at the start of every walker are one."""
+"""Relative tolerance: a file's log density is the same as this run's if both agree so well at the start of every
+walker."""
 BEGUN = 1e-3
-"""Standard deviations: starts that differ by less are one, found by an optimiser a second time."""
+"""Tolerance in standard deviations: starts that differ by less are taken as the same start, which an optimiser found a
+second time."""
 
 
 @dataclass
@@ -33,32 +35,32 @@ class Chain:
 
     names: tuple[str, ...]
     settings: str
-    """What the walkers do, in words."""
+    """The moves of the walkers, in words."""
     centre: Numbers
-    """(p,) of the independent proposals."""
+    """(p,) centre of the independent proposals."""
     spread: Numbers
-    """(p, p) their covariance."""
+    """(p, p) covariance of the independent proposals."""
     start: Numbers
-    """(walkers, p) where the walkers began."""
+    """(walkers, p) the parameters at which the walkers began."""
     start_density: Numbers
-    """(walkers,) the log density there."""
+    """(walkers,) the log density at the start of each walker."""
     random_state: tuple[Any, ...]
-    """Of numpy's `RandomState`, after the last step."""
+    """The state of numpy's `RandomState` after the last step."""
     steps: list[Numbers] = field(default_factory=list)
-    """Blocks of (steps, walkers, p)."""
+    """The parameters of all steps, in blocks of (steps, walkers, p)."""
     densities: list[Numbers] = field(default_factory=list)
-    """Blocks of (steps, walkers)."""
+    """The log densities of all steps, in blocks of (steps, walkers)."""
     accepted: list[Numbers] = field(default_factory=list)
-    """Blocks of (walkers,): how many proposals were accepted."""
+    """How many proposals each walker accepted, in blocks of (walkers,)."""
     lengths: list[int] = field(default_factory=list)
-    """Steps of each block."""
+    """How many steps each block has."""
 
     def __len__(self) -> int:
         return sum(len(block) for block in self.steps)
 
     @property
     def last(self) -> tuple[Numbers, Numbers]:
-        """Where the walkers are, and the log density there."""
+        """The last position of the walkers, and the log density there."""
         return (self.steps[-1][-1], self.densities[-1][-1]) if self.steps else (self.start, self.start_density)
 
     def append(self, steps: Numbers, densities: Numbers, accepted: Numbers, random_state: tuple[Any, ...]) -> None:

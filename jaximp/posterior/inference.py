@@ -62,8 +62,9 @@ class PosteriorSettings:
     """`[posterior]`: what posteriors are drawn with."""
 
     seed: int = 0
+    """Seed of the random numbers: the same seed gives the same draws."""
     ess: float = 1000.0
-    """Effective samples of every parameter."""
+    """Effective samples that are drawn of every parameter."""
     heavy_tails: bool = False
     """Noise of Student's t with four degrees of freedom, in place of Gaussian noise."""
     prior: Mapping[str, Normal | LogNormal] = field(default_factory=dict)

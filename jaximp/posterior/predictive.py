@@ -15,9 +15,9 @@ from jaximp.posterior.priors import Prior
 from jaximp.types import AnyArray, Numbers
 
 NU = 4.0
-"""Degrees of freedom of heavy-tailed noise, unless told."""
+"""Degrees of freedom of heavy-tailed noise, where none are given."""
 BLOCKS = 30
-"""Stretches of time by whose means a mean score is known."""
+"""The standard error of a mean score comes from the means of so many stretches of time."""
 
 
 def log_score(
@@ -51,7 +51,7 @@ def log_scores(samples: Num[AnyArray, "draws P"], rows: WhiteRows, *, heavy_tail
     samples, p = np.asarray(samples, float), rows.W.shape[-1]
     if samples.shape[1] != p + len(rows.count):
         raise ValueError(
-            f"samples have {samples.shape[1]} columns: {p} parameters and {len(rows.count)} logarithms of noise must be"
+            f"samples have {samples.shape[1]} columns: give {p} parameters and {len(rows.count)} logarithms of noise"
         )
     nu = jnp.asarray(NU if heavy_tails is True else float(heavy_tails))
     out = np.zeros(rows.y.shape)
@@ -94,13 +94,13 @@ def torque_bands(
 
 @dataclass(frozen=True)
 class PriorPredictive:
-    """What torque a prior expects, against the measured one."""
+    """The torque that a prior expects, compared with the measured one."""
 
     ratio: tuple[float, float, float]
     """Root mean square of the torque that the prior expects over that of the measured one: 5, 50 and 95 % of draws.
     NaN where all is flat. Far from one on both sides of it, the prior and the recording contradict each other."""
     flat: tuple[str, ...]
-    """Parameters about which the prior says nothing, and that took no part."""
+    """Parameters about which the prior says nothing; they are left out."""
 
 
 def prior_predictive(

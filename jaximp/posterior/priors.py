@@ -18,7 +18,9 @@ class Normal:
     """A parameter known as `mean` give or take the standard deviation `sd`, in its own unit."""
 
     mean: float
+    """The most likely value, in the parameter's unit."""
     sd: float
+    """The standard deviation, in the parameter's unit."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,9 @@ class LogNormal:
     """A positive parameter, with even odds above `median`, and with 68 % within a `factor` of it."""
 
     median: float
+    """The value that the parameter exceeds with even odds, in its unit."""
     factor: float
+    """The parameter lies between `median / factor` and `median * factor` with a probability of 68 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +48,18 @@ class Prior(eqx.Module):
     """Independent of the data: flat in every parameter that is not `proper`."""
 
     mean: Float[AnyArray, "*M p"]
-    """Of the parameters, or of their logarithms."""
+    """The mean of the parameters, or of their logarithms."""
     root: Float[AnyArray, "*M p p"]
-    """The precision is root' root; rows of zeros are flat."""
+    """The precision is root' root; a parameter whose row is zero has a flat prior."""
     constant: Float[AnyArray, "*M"]
-    """Which makes the proper part integrate to one."""
+    """The constant that makes the proper part integrate to one."""
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
-    """Parameters that are log-normal, and so positive."""
+    """Which parameters are log-normal, and therefore positive."""
     proper: tuple[bool, ...] = eqx.field(static=True)
 
     def log_density(self, x: Num[AnyArray, " p"]) -> Float[Array, ""]:
-        """Of the parameters `x`, -inf where one of them is impossible."""
+        """Log density of the parameters `x`; -inf where one of them is impossible."""
         logarithmic, x = np.array(self.logarithmic), jnp.asarray(x)
         possible = (~logarithmic | (x > 0)).all()
         logs = jnp.log(jnp.where(logarithmic & (x > 0), x, 1))
@@ -63,7 +67,8 @@ class Prior(eqx.Module):
         return jnp.where(possible, self.constant - (distance**2).sum() / 2 - logs.sum(), -jnp.inf)
 
     def information(self) -> Numbers:
-        """(p, p) what it adds to the information of the data, at the median of what is log-normal."""
+        """(p, p) information that the prior adds to that of the data, at the median of parameters that are
+        log-normal."""
         mean = np.asarray(self.mean)
         root = np.asarray(self.root) / np.where(self.logarithmic, np.exp(mean), 1)
         return np.asarray(root.T @ root)

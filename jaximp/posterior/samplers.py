@@ -33,7 +33,7 @@ from jaximp.posterior.files import Chain, resume_chain, write_chain
 from jaximp.types import AnyArray, Numbers, Progress
 
 WALKERS = 32
-"""At least; and four for each parameter."""
+"""There are at least so many walkers, and at least four for each parameter."""
 INDEPENDENT = 0.5
 """Share of emcee's steps that propose from Student's t about the start; the others are differential evolution."""
 TAIL_DOF = 5.0
@@ -41,7 +41,7 @@ TAIL_DOF = 5.0
 TIMES = 50
 """Autocorrelation times that every walker must have gone, for these to be known (emcee's own advice)."""
 BURN_IN = 5
-"""Autocorrelation times dropped from the beginning; and a tenth of the chain at least."""
+"""How many autocorrelation times are dropped from the beginning, and at least a tenth of the chain."""
 FIRST_CHECK, CHECK_GROWTH, BLOCK = 300, 1.3, 100
 """Steps before the first check, growth from check to check, and steps between two reports of progress."""
 SAVE_EVERY = 30.0
@@ -52,9 +52,9 @@ FLAT = 1e-12
 """Share of the largest curvature, in units of each parameter's own, below which a direction is flat."""
 
 CHAINS = 4
-"""Of every window, each adapting a step size of its own."""
+"""Chains of every window; each adapts a step size of its own."""
 LANES = 128
-"""So many windows go together: few enough for their numbers to stay in the cache."""
+"""How many windows are sampled together: few enough for their numbers to stay in the cache."""
 WARM_UP, ACCEPT = 150, 0.95
 """Steps that adapt the step size, and the acceptance that it aims at; larger steps do not enter curved tails."""
 LEAPS, LONGEST_STEP, JITTER = 4, 0.45, (0.3, 1.2)
@@ -121,7 +121,7 @@ def sample_posterior(
 
 
 def _silent(share: float) -> None:
-    """Report to nobody."""
+    """Progress that nobody wants to see."""
 
 
 def _given(log_density: Any, start: AnyArray | None, covariance: AnyArray | None) -> tuple[Numbers, Numbers | None]:
@@ -256,7 +256,7 @@ class _Run:
         self.sampler.log_prob_fn = evaluate  # emcee's wrapper of it would print wherever a run is interrupted
 
     def block(self, steps: int) -> None:
-        """So many steps more."""
+        """Take so many more steps."""
         import emcee
 
         places, density = self.chain.last

@@ -356,7 +356,7 @@ def _gain(channel: str, gain: Any) -> tuple[float | None, str | None]:
     except (TypeError, ValueError):
         value = math.nan
     if not math.isfinite(value) or value == 0:
-        raise RecordingError(f'{channel}: gain {gain!r} is not a number other than 0, such as 2.5 or "35.15 N/V"')
+        raise RecordingError(f'{channel}: gain must be a number other than 0, not {gain!r}: write 2.5 or "35.15 N/V"')
     return value, unit.strip() or None
 
 
@@ -636,7 +636,7 @@ def _on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], 
 
 
 def _is_even(stamps: NDArray[np.float64]) -> bool:
-    """Whether nothing is to be done."""
+    """Whether the stamps are even already, so that nothing is to be done."""
     step = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
     late = stamps - (stamps[0] + step * np.arange(len(stamps)))
     return bool(1e-9 < step < 1e6 and np.abs(late).max() <= 1e-7 * step)

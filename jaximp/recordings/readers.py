@@ -17,9 +17,9 @@ import numpy as np
 from jaximp.types import nearest
 
 MOST_COLUMNS = 1000
-"""A variable with more in both directions is no recording."""
+"""A variable that is longer than this along both axes is no recording."""
 MOST_NUMBERS = 1_000_000_000
-"""A struct that holds more is not unpacked to count them."""
+"""A struct that holds more numbers than this is not unpacked to count them."""
 THREADS_PAY = 200_000
 """Rows of a Parquet file from which its columns are read at the same time: to hand over small ones takes longer."""
 COMPRESSED = 15
@@ -31,7 +31,7 @@ class RecordingError(ValueError):
 
 
 class UnavailableError(RecordingError):
-    """A file that could not be read just now, whatever is in it."""
+    """A file that could not be read for now, for a reason that does not lie in its content."""
 
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
         raise RecordingError("is not UTF-8 text; save it with that encoding") from None
     except Exception as error:
         if isinstance(error, OSError) and error.errno is not None:
-            raise UnavailableError(f"cannot be read ({os.strerror(error.errno)}); mend that and try again") from None
+            raise UnavailableError(f"cannot be read ({os.strerror(error.errno)}); solve that and try again") from None
         cause = " ".join(str(error).split())[:100] or type(error).__name__
         remedy = "the file is damaged, cut short or of another kind; write it anew"
         raise RecordingError(f"cannot be read as {path.suffix} ({cause}): {remedy}") from None
@@ -68,7 +68,7 @@ def count_samples(path: Path, names: list[str]) -> int:
 
 
 def _lines(path: Path, names: list[str]) -> int:
-    """Lines that hold something, less the header's."""
+    """The number of lines that hold something, without the header."""
     count, last = 0, b"\n"
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -133,7 +133,7 @@ def _own(file: Any, name: str) -> Any:
 
 
 def _npz_samples(path: Path, names: list[str]) -> int:
-    """From the headers of the arrays inside; the numbers stay compressed."""
+    """Read from the headers of the arrays inside; the numbers stay compressed."""
     import zipfile
 
     shapes = {}
@@ -325,7 +325,7 @@ _READERS: dict[str, Callable[[Path, list[str]], dict[str, Any]]] = {
 FORMATS = tuple(_READERS)
 """Extensions of files that can be read."""
 MATRICES = (".mat", ".h5", ".hdf5", ".npz")
-"""Those in which one variable may hold several columns."""
+"""Extensions of files in which one variable may hold several columns."""
 
 
 def _require(name: str, available: Iterable[str], what: str | None = None) -> None:

@@ -33,7 +33,7 @@ from jaximp.simulation.neuromuscular import (
 from jaximp.types import Numbers, Progress, Recording
 
 EVERY = 2
-"""Samples of the simulation for each that is recorded."""
+"""One of so many samples of the simulation is recorded."""
 SETTLE = 1.0
 """The noise of the static task starts at zero; from here on it is recorded [s]."""
 STATIC = (0.5, 1.1)
@@ -70,7 +70,7 @@ class Sensors:
     """What the recordings add to the simulation."""
 
     position_step: float = 1e-6
-    """Of the encoders [m]; zero for none. The paper's yield 1 um."""
+    """Step of the encoders [m]; zero for none. Those of the paper have 1 um."""
     force_noise: float = 0.0
     """Standard deviation of the white noise of the force [N]."""
 

@@ -32,27 +32,27 @@ class HeldArm(eqx.Module):
     """The subject's arm, and what the robot measures with."""
 
     lengths: tuple[float, float] = eqx.field(static=True, default=(0.29, 0.34))
-    """Upper arm and forearm [m]."""
+    """Lengths of upper arm and forearm [m]."""
     inertia: Float[Any, "3"] = array_field(default=(0.26815, 0.08375, 0.07367))
     """Base inertial parameters xi [kg m^2]; these are the arm of Börner et al. 2020."""
     damping: Float[Any, "2 2"] = array_field(default=((2.42, 1.20), (1.20, 1.42)))
-    """Before any reflex [N m s/rad]: a choice, a twelfth of the stiffness."""
+    """Damping before any reflex [N m s/rad]: a choice, a twelfth of the stiffness."""
     stiffness: Float[Any, "2 2"] = array_field(default=((29.05, 14.37), (14.37, 17.08)))
-    """Before any reflex [N m/rad]: a choice, the mean of Börner et al. 2020."""
+    """Stiffness before any reflex [N m/rad]: a choice, the mean of Börner et al. 2020."""
     posture: Float[Any, "2"] = array_field(default=(0.08, 1.0))
     """Angles at rest [rad]."""
     hand_force: Float[Any, "2"] = array_field(default=(5.0, 0.0))
-    """What the subject presses with at rest [N], the same torque throughout."""
+    """Force with which the subject presses at rest [N]; its torque stays the same throughout."""
     reflex_gain: Float[Any, ""] = array_field(default=0.5)
-    """By which share stiffness and damping have risen when all reflexes are there; each brings a third. A choice."""
+    """Share by which stiffness and damping have risen when all reflexes have set in; each brings a third. A choice."""
     rise: Float[Any, ""] = array_field(default=0.02)
     """Time in which each reflex comes in [s]. A choice."""
     yields: bool = eqx.field(static=True, default=False)
     """Whether there is a cuff that yields between robot and hand, and flesh under it."""
     cuff_stiffness: Float[Any, ""] = array_field(default=10e3)
-    """Of both axes [N/m], if it does. A choice."""
+    """Stiffness of the cuff along both axes [N/m], if it yields. A choice."""
     cuff_damping: Float[Any, ""] = array_field(default=40.0)
-    """[N s/m]. A choice."""
+    """Damping of the cuff [N s/m]. A choice."""
     force_noise: Float[Any, ""] = array_field(default=0.05)
     """Standard deviation of the white noise of each force [N]. A choice."""
     position_noise: Float[Any, ""] = array_field(default=1e-5)
@@ -74,19 +74,19 @@ class HeldTrials(eqx.Module):
     """What the robot measures in T trials of N samples, and the truth behind it."""
 
     time: Float[Array, " N"]
-    """From the onset of the perturbation [s]."""
+    """Time from the onset of the perturbation [s]."""
     position: Float[Array, "T N 2"]
-    """Measured: of the hand [m]."""
+    """Measured position of the hand [m]."""
     force: Float[Array, "T N 2"]
-    """Measured: on the hand [N]."""
+    """Measured force on the hand [N]."""
     angles: Float[Array, "T N 2"]
-    """[rad]."""
+    """True angles of the joints [rad]."""
     velocities: Float[Array, "T N 2"]
-    """[rad/s]."""
+    """True velocities of the joints [rad/s]."""
     accelerations: Float[Array, "T N 2"]
-    """[rad/s^2]."""
+    """True accelerations of the joints [rad/s^2]."""
     torque: Float[Array, "T N 2"]
-    """Of the outside force on the joints, without noise [N m]."""
+    """True torque of the outside force on the joints [N m]."""
 
 
 def hold(
@@ -141,7 +141,7 @@ def _muscles(arm: HeldArm, t: Array, q: Array, dq: Array) -> Array:
 
 
 def _acceleration(arm: HeldArm, t: Array, q: Array, dq: Array, torque: Array) -> Array:
-    """Of the joints under the torque of an outside force [rad/s^2]."""
+    """Acceleration of the joints under the torque of an outside force [rad/s^2]."""
     xi = jnp.asarray(arm.inertia)
     left = torque - _muscles(arm, t, q, dq) - rigid_body_torque(q, dq, jnp.zeros_like(dq), xi)
     return solve_pair(mass_matrix(q, xi), left)

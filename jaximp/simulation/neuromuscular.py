@@ -50,27 +50,28 @@ class NeuromuscularArm(eqx.Module):
     """The arm, its muscles, its nerves and the handle. Defaults: the paper's subject. `vmap` over any field."""
 
     lengths: Float[Any, "2"] = array_field(default=(0.29, 0.34))
-    """Upper arm and forearm [m]."""
+    """Lengths of upper arm and forearm [m]."""
     inertia: Float[Any, "3"] = array_field(default=(0.1945, 0.0737, 0.0838))
     """Base inertial parameters of eq. (12) [kg m^2]: those that the paper prints."""
     moment_arms: Float[Any, "6 2"] = array_field(
         default=((0.0536, 0), (-0.0536, 0), (0, 0.0316), (0, -0.0267), (0.0386, 0.0427), (-0.0388, -0.0300))
     )
-    """Of `MUSCLES` at shoulder and elbow [m], positive where they flex."""
+    """Moment arms of `MUSCLES` at shoulder and elbow [m], positive where they flex."""
     intrinsic_stiffness: Float[Any, "6"] = array_field(default=(1526, 1526, 961, 961, 4289, 4289))
-    """K0 [N/m]. Calibrated: the mean stiffness during the perturbation is the paper's."""
+    """Stiffness of a muscle without activation, K0 [N/m]. Calibrated: the mean stiffness during the perturbation is the
+    paper's."""
     stiffness_per_force: Float[Any, ""] = array_field(default=75.0)
-    """K1 [1/m]."""
+    """Stiffness that an activation of 1 N adds, K1 [1/m]."""
     damping_time: Float[Any, ""] = array_field(default=1 / 12)
     """Damping of a muscle over its stiffness [s]."""
     feedback_gain: Float[Any, ""] = array_field(default=0.3)
-    """Of the delayed feedback, as a share of K0. A choice; 0 to 0.6 moves Table 1 by less than a tenth."""
+    """Gain of the delayed feedback, as a share of K0. A choice; 0 to 0.6 moves Table 1 by less than a tenth."""
     feedback_delay: float = eqx.field(static=True, default=VOLUNTARY_DELAY)
-    """[s]; the paper's variation, equal to the voluntary delay."""
+    """Delay of the feedback [s]; the paper's variation, equal to the voluntary delay."""
     noise_floor: Float[Any, ""] = array_field(default=4.4)
     """Activation noise of a muscle that is not active [N], times `neural_noise`. Calibrated."""
     noise_per_force: Float[Any, ""] = array_field(default=0.05)
-    """What an activation of 1 N adds to it. Calibrated."""
+    """What an activation of 1 N adds to that noise. Calibrated."""
     handle: Handle = Handle((5.0, 5.0), (20.0, 20.0))
 
     @property
@@ -92,7 +93,7 @@ class Reach(eqx.Module):
     goal: Float[Any, "2"] = array_field(default=(0.0, 0.55))
     """[m]"""
     duration: float = eqx.field(static=True, default=2.0)
-    """T_mov: what is simulated [s]."""
+    """Duration of the trial, T_mov [s]."""
     moving: Float[Any, ""] = array_field(default=1.241 / 2)
     """Share of it, in its middle, in which the hand moves, with least jerk. Calibrated to the peak speeds that the
     paper prints, which are 1.6 times those of a movement that takes all of the time."""
@@ -116,17 +117,17 @@ class Drive(NamedTuple):
     """What the nerves intend at one instant."""
 
     q: Float[Array, "2 *#T"]
-    """Planned angles [rad]."""
+    """Planned angles of the joints [rad]."""
     dq: Float[Array, "2 *#T"]
     """[rad/s]"""
     activation: Float[Array, "6 *#T"]
-    """Feedforward [N]."""
+    """Feedforward activation of the muscles [N]."""
     noise: Float[Array, "6 *T"]
     """See `neural_noise`."""
 
 
 class ArmState(NamedTuple):
-    """Between two samples."""
+    """The state of the arm between two samples."""
 
     q: Float[Array, "2 *T"]
     """[rad]"""
@@ -139,14 +140,14 @@ class ArmState(NamedTuple):
 
 
 class ArmSample(NamedTuple):
-    """What one instant was like."""
+    """What is recorded of one instant."""
 
     position: Float[Array, "2 *T"]
-    """Of the hand [m]."""
+    """Position of the hand [m]."""
     velocity: Float[Array, "2 *T"]
-    """[m/s]"""
+    """Velocity of the hand [m/s]."""
     acceleration: Float[Array, "2 *T"]
-    """[m/s^2]"""
+    """Acceleration of the hand [m/s^2]."""
     command: Float[Array, "2 *T"]
     """Perturbing force [N]."""
     stiffness: Float[Array, "3 *T"]
@@ -154,14 +155,14 @@ class ArmSample(NamedTuple):
 
 
 class Push(NamedTuple):
-    """The perturbations: when, and which force."""
+    """When the perturbations begin, and how large they are."""
 
     trigger: Float[Array, ""]
-    """Along the second axis of the hand [m]."""
+    """Position along the second axis of the hand at which the perturbation begins [m]."""
     force: Float[Array, "2 *T"]
     """First peak [N]; zero in an unperturbed trial."""
     profile: Float[Array, " P"]
-    """What a first peak of 1 N is from the onset on, sample by sample, and zero at its end."""
+    """The force of a perturbation with a first peak of 1 N, sample by sample from the onset on; zero at its end."""
 
 
 def perturbing_forces(key: PRNGKeyArray, repeats: int = 3, amplitude: float = 40.0) -> Float[Array, "T 2"]:
@@ -214,7 +215,7 @@ def feedforward(
 
 
 def init(arm: NeuromuscularArm, drive: Drive) -> ArmState:
-    """At the planned start, and the feedback has seen no error."""
+    """The state at the planned start, where the feedback has seen no error yet."""
     delay, trials = round(arm.feedback_delay * RATE), drive.noise.shape[1:]
     never = jnp.full(trials, np.iinfo(np.int32).max, jnp.int32)
     q, dq = (jnp.broadcast_to(x, (2, *trials)) for x in (drive.q, drive.dq))
@@ -246,7 +247,7 @@ def step(
 
 
 def _command(push: Push, since: Array) -> Array:
-    """Perturbing force [N] so many samples after the onset."""
+    """Perturbing force [N], a number of samples after the onset."""
     return push.force * push.profile[jnp.clip(since, 0, len(push.profile) - 1)]
 
 
@@ -273,7 +274,7 @@ def _muscle_torque(arm: NeuromuscularArm, planned: Array, noise: Array, error: A
 def _acceleration(
     arm: NeuromuscularArm, q: Array, dq: Array, drive: Drive, seen: Array, command: Array
 ) -> tuple[Array, Array]:
-    """Of the joints [rad/s^2], and the activation of the muscles [N]."""
+    """Acceleration of the joints [rad/s^2], and the activation of the muscles [N]."""
     gain = (arm.feedback_gain * arm.intrinsic_stiffness)[:, None]
     planned = drive.activation + gain * jnp.tensordot(jnp.asarray(arm.moment_arms), seen, 1)
     error = drive.q - q + arm.damping_time * (drive.dq - dq)

@@ -54,7 +54,7 @@ Scalar = Float[Any, ""]
 
 
 class Human(eqx.Module):
-    """What holds the handle: an inertia that moves with the motor, and a torque that opposes the motion."""
+    """Whatever holds the handle: an inertia that moves with the motor, and a torque that opposes the motion."""
 
     inertia: eqx.AbstractVar[Scalar]
     """Inertia at the motor side [kg m^2]."""
@@ -171,9 +171,9 @@ class Rig(eqx.Module):
     """Standard deviation of the white noise of a torque sample [N m]."""
 
     proportional: Scalar = array_field(default=0.08)
-    """[N m/rad]."""
+    """Proportional gain of the controller [N m/rad]."""
     integral: Scalar = array_field(default=1.2)
-    """[N m/(rad s)]."""
+    """Integral gain of the controller [N m/(rad s)]."""
     derivative: Scalar = array_field(default=1.6e-3)
     """[N m s/rad]."""
     derivative_time: Scalar = array_field(default=4.5e-3)
@@ -251,7 +251,7 @@ class RigMotion(eqx.Module):
     """What the rig measures, and the truth behind it. Every array has one value for each of the N records."""
 
     time: Float[Array, " N"]
-    """[s], from 0."""
+    """Time from zero on [s]."""
     position: Float[Array, " N"]
     """Measured: quantised motor angle [rad]."""
     torque: Float[Array, " N"]
