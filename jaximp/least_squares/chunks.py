@@ -1,4 +1,4 @@
-"""Who works on which rows: a recording goes through `engine` in chunks, several at a time, however long it is.
+"""Chunked, multi-threaded evaluation of sliding windows: `engine` works on a recording of any length in pieces.
 
 A chunk is the rows of some thousand windows. Chunks lie on a grid that begins with the recording, so that one that is
 read piece by piece gives the same numbers, to the last bit, as one that lies in memory.
@@ -33,7 +33,8 @@ from jaximp.least_squares.engine import (
     solve_shortest,
 )
 from jaximp.least_squares.window import SlidingFit, WindowFit, solve_window
-from jaximp.numerics.compilation import compiled
+from jaximp.numerics.compilation import compiled, is_traced
+from jaximp.numerics.linear_algebra import root
 from jaximp.types import AnyArray
 
 LANES = {True: 500, False: 800}
@@ -123,7 +124,7 @@ def lags_for_sums(noise: Numbers | Array | None, window: int, outputs: int) -> i
     """How many lags of the noise's autocovariance the shared sums take in; None where they cannot."""
     if noise is None:
         return 0
-    if noise.ndim != 1 or isinstance(noise, jax.core.Tracer):
+    if noise.ndim != 1 or is_traced(noise):
         return None
     size = np.abs(np.asarray(noise))
     lags = 1 + int(np.flatnonzero(size > NEGLIGIBLE_NOISE * size[0]).max(initial=0))
@@ -172,7 +173,7 @@ def solve_pieces(pieces: Iterable[Piece], task: Task) -> Iterator[SlidingFit]:
 
 def solve_traced(recording: Any, task: Task) -> Any:
     """As `solve_all` inside of `jit`, `vmap` or `grad`, or on an accelerator, all chunks at a time."""
-    plan, (W, y, scale) = task.plan, recording
+    plan, (W, y, scale), task = task.plan, recording, task._replace(noise=jax.tree.map(jnp.asarray, task.noise))
     n_windows = task.windows(task.before + len(y))
     n_chunks = -(-n_windows // plan.windows)
     columns = jnp.where(scale > 0, jnp.concatenate([W.T, y[None]]), 0) * scale
@@ -206,6 +207,10 @@ def _repaired_traced(fit: ChunkFit, length: Array, task: Task, columns: Array, s
     which = jnp.nonzero(fixed.doubtful, size=len(fixed.doubtful), fill_value=0)[0]
     count = fixed.doubtful.sum()
 
+    def finite_or(old: Array, new: Array) -> Array:
+        # Where there is no solution, NaN comes last: before, it would make derivatives of other windows NaN.
+        return new if new.dtype == bool else jnp.where(jnp.isfinite(new), new, old)
+
     def decompose(state: tuple[Array, ChunkFit]) -> tuple[Array, ChunkFit]:
         done, found = state
         k = which[done]
@@ -214,7 +219,7 @@ def _repaired_traced(fit: ChunkFit, length: Array, task: Task, columns: Array, s
         kept = lax.dynamic_slice_in_dim(scale, k * task.plan.step, task.window)
         kept = kept * (jnp.arange(task.window) >= task.window - length[k])
         exact = _decomposed(rows.T.reshape(*shape, -1), kept.reshape(shape), task.noise, task.plan.statistics)
-        return done + 1, jax.tree.map(lambda all_, one: all_.at[k].set(one), found, exact)
+        return done + 1, jax.tree.map(lambda all_, one: all_.at[k].set(finite_or(all_[k], one)), found, exact)
 
     exact = lax.while_loop(lambda state: state[0] < count, decompose, (jnp.zeros((), int), fixed))[1]
 
@@ -388,10 +393,10 @@ def _finished(fit: ChunkFit, length: Any, task: Task, first: int) -> Any:
             theta=or_nan(fit.theta),
             stderr=or_nan(stderr),
             dof=or_nan(dof),
-            cond=or_nan(high / low),
+            cond=or_nan(high / xp.where(low > 0, low, 1)),
             sigma_min=or_nan(low),
             excitation=or_nan(1 / norm),
-            residual_rms=or_nan(xp.sqrt(mean_square)),
+            residual_rms=or_nan(np.sqrt(mean_square) if xp is np else root(mean_square)),
             vaf=or_nan(vaf),
             samples=n.astype(int),
             first=xp.maximum(end - length, 0) // plan.outputs,

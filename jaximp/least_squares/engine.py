@@ -42,7 +42,8 @@ from jax import lax
 from jaxtyping import Array
 
 from jaximp.numerics.compilation import keep
-from jaximp.numerics.lanes import Rows, cholesky, extreme_singular_values, substitute, sum_of
+from jaximp.numerics.lanes import Rows, cholesky, divided, extreme_singular_values, substitute, sum_of
+from jaximp.numerics.linear_algebra import root
 
 BLOCK = 16
 """Rows in a block, at least."""
@@ -218,24 +219,68 @@ def solve_shortest(
     Windows grow back in time block by block, so that the sums of a length are those of the one before it and a few
     more. A plan for this has one window in a block. Arguments as in `solve_chunk`.
 
+    The derivatives are those of the windows that were found: what is wanted has none.
+
     **Returns:** the fits, and how many blocks each took: none where no length sufficed.
     """
-    p, wanted = len(columns) - 1, jax.tree.map(jnp.asarray, wanted)
-    features, R = _features(plan, columns, scale, noise)
-    groups = _sum_of_rows(_in_blocks(features, plan), partial(_products, p=p, plan=plan))
-    blocks, split = keep(jnp.concatenate(groups)), np.cumsum([len(group) for group in groups])[:-1]
-    ends = _ends(features, plan, p) if plan.lags else None
-    last = ends(plan.room * plan.block) if ends else jnp.zeros(0)
+
+    @jax.custom_jvp
+    def solve(columns: Array, scale: Array, noise: Array | None, wanted: Wanted) -> tuple[ChunkFit, Array]:
+        return _search(_Growing(plan, columns, scale, noise), wanted)
+
+    @solve.defjvp
+    def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        found, taken = solve(*primals)
+
+        def again(columns: Array, scale: Array, noise: Array | None) -> ChunkFit:
+            return _of_lengths(_Growing(plan, columns, scale, noise), taken, primals[3].blocks)
+
+        slope = jax.jvp(again, primals[:3], tangents[:3])[1]
+        return (found, taken), (slope, np.zeros(taken.shape, jax.dtypes.float0))
+
+    return solve(columns, scale, *jax.tree.map(jnp.asarray, (noise, wanted)))
+
+
+class _Growing:
+    """Sums of the blocks of a chunk, from which windows of any length up to a block are put together."""
+
+    def __init__(self, plan: Plan, columns: Array, scale: Array, noise: Array | None) -> None:
+        self.plan, self.noise, self.p = plan, noise, len(columns) - 1
+        features, self.R = _features(plan, columns, scale, noise)
+        groups = _sum_of_rows(_in_blocks(features, plan), partial(_products, p=self.p, plan=plan))
+        self.blocks, self.split = keep(jnp.concatenate(groups)), np.cumsum([len(group) for group in groups])[:-1]
+        self.ends = _ends(features, plan, self.p) if plan.lags else None
+        self.last = self.ends(plan.room * plan.block) if self.ends else jnp.zeros(0)
+
+    def block(self, before: Array) -> Array:
+        """Of every lane the block so many before the last."""
+        return keep(lax.dynamic_slice_in_dim(self.blocks, self.plan.room - 1 - before, self.plan.lanes, axis=1))
+
+    def across(self, length: Array) -> Rows | None:
+        """What coloured noise adds at the ends of windows of so many blocks."""
+        if self.ends is None or self.noise is None:
+            return None
+        both = self.ends((self.plan.room - length) * self.plan.block), self.last
+        return _across(both, _outside(both, self.plan, self.noise, self.p), self.plan, 0, self.p)
+
+    def fit(self, total: Array, across: Rows | None) -> ChunkFit:
+        sums = keep(tuple(jnp.split(total, self.split)))
+        return _solve(self.plan, self.p, self.R, sums, _diagonal(sums, self.p), self.noise, across)
+
+    def finished(self, found: ChunkFit, taken: Array) -> ChunkFit:
+        found = found._replace(solvable=taken > 0)
+        return _in_given_units(jax.tree.map(lambda x: x[None], found), self.R, self.plan)
+
+
+def _search(growing: _Growing, wanted: Wanted) -> tuple[ChunkFit, Array]:
+    """Every length in turn, until all lanes have found theirs."""
+    lanes = growing.plan.lanes
 
     def grow(before: Array, total: Array) -> Array:
-        return total + keep(lax.dynamic_slice_in_dim(blocks, plan.room - 1 - before, plan.lanes, axis=1))
+        return total + growing.block(before)
 
     def fit_of(length: Array, total: Array) -> ChunkFit:
-        sums, across = keep(tuple(jnp.split(total, split))), None
-        if ends is not None and noise is not None:
-            both = ends((plan.room - length) * plan.block), last
-            across = _across(both, _outside(both, plan, noise, p), plan, 0, p)
-        return _solve(plan, p, R, sums, _diagonal(sums, p), noise, across)
+        return growing.fit(total, growing.across(length))
 
     def unfinished(state: tuple[Array, Array, Array, ChunkFit]) -> Array:
         return (state[0] < len(wanted.blocks)) & (state[2] == 0).any()
@@ -249,12 +294,25 @@ def solve_shortest(
         found = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, found)
         return keep((k + 1, total, jnp.where(better, length, taken), found))
 
-    none, total = jnp.zeros((), wanted.blocks.dtype), jnp.zeros_like(blocks[:, : plan.lanes])
+    none, total = jnp.zeros((), wanted.blocks.dtype), jnp.zeros_like(growing.blocks[:, :lanes])
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fit_of, none, total))
-    state = none, total, jnp.zeros(plan.lanes, wanted.blocks.dtype), nothing
+    state = none, total, jnp.zeros(lanes, wanted.blocks.dtype), nothing
     _, _, taken, found = lax.while_loop(unfinished, lengthen, state)
-    found = found._replace(solvable=taken > 0)
-    return _in_given_units(jax.tree.map(lambda x: x[None], found), R, plan), taken
+    return growing.finished(found, taken), taken
+
+
+def _of_lengths(growing: _Growing, taken: Array, lengths: Array) -> ChunkFit:
+    """The same fits, each lane's of the length that it took: loops of fixed length, which run backwards too."""
+
+    def grow(before: Array, total: Array) -> Array:
+        return total + jnp.where(before < taken, growing.block(before), 0)
+
+    def choose(chosen: Rows | None, length: Array) -> tuple[Rows | None, None]:
+        return jax.tree.map(lambda new, old: jnp.where(taken == length, new, old), growing.across(length), chosen), None
+
+    total = lax.fori_loop(0, growing.plan.room, grow, jnp.zeros_like(growing.blocks[:, : growing.plan.lanes]))
+    across = jax.tree.map(jnp.zeros_like, growing.across(lengths[0]))
+    return growing.finished(growing.fit(total, lax.scan(choose, across, lengths)[0]), taken)
 
 
 def _meets(fit: ChunkFit, wanted: Wanted) -> Array:
@@ -316,7 +374,7 @@ def _for_statistics(X: Array, y: Array, scale: Array, plan: Plan, noise: Array |
         further.append(counts.astype(X.dtype)[None])
     if noise is None:
         return tuple(further)
-    columns, weight = lax.stop_gradient(X[:-1]) * scale, scale[None] ** 2
+    columns, weight = X[:-1] * scale, scale[None] ** 2
     return *further, _convolved(columns, noise, plan) * scale, scale[None], weight, _convolved(weight, noise**2, plan)
 
 
@@ -516,16 +574,16 @@ def _solve(plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array |
         return ChunkFit(theta, solvable, share)
     rss = (R[p, p] * triangle[p][0]) ** 2
     weight, vaf, _, samples = _residuals(plan, rss, inner, R, sums)
-    constant = tuple(lax.stop_gradient(row[: p - i]) for i, row in enumerate(triangle[:p]))
-    own_inverse, given, inverse = _triangle_and_inverses(constant, R[:p, :p])
+    alone = tuple(row[: p - i] for i, row in enumerate(triangle[:p]))
+    own_inverse, given, inverse = _triangle_and_inverses(alone, R[:p, :p])
     sigma_max, sigma_min = extreme_singular_values(given, inverse)
     norm = jnp.sqrt((inverse**2).sum(axis=1))
     if across is None or noise is None:
         dof = samples - p
-        stderr = norm * jnp.sqrt(rss / jnp.where(dof > 0, dof, jnp.nan))
+        stderr = jnp.where(dof > 0, norm * root(rss / jnp.where(dof > 0, dof, 1)), jnp.nan)
     else:
         stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, weight)
-    statistics = Statistics(stderr, dof, norm, sigma_max, sigma_min, rss / weight, vaf, samples)
+    statistics = Statistics(stderr, dof, norm, sigma_max, sigma_min, divided(rss, weight), vaf, samples)
     return ChunkFit(theta, solvable, share, statistics)
 
 
@@ -622,7 +680,7 @@ def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Arra
         rest = own[i]
         for k in range(i + 1, p):
             rest = rest - triangle[i][k - i] * own[k]
-        own[i] = keep(rest / triangle[i][0])
+        own[i] = keep(divided(rest, triangle[i][0]))
     inverse = list(own)
     for i in reversed(range(p)):
         rest = own[i]
@@ -646,8 +704,8 @@ def _coloured(
     trace = noise[0] * weight - sum_of(shape[i, i] for i in range(p))
     square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
     spread = keep(jnp.stack([sum_of(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
-    variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, jnp.nan))
-    return jnp.sqrt(variance), trace**2 / square
+    variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, 1))
+    return jnp.where(trace > 0, root(variance), jnp.nan), divided(trace**2, square)
 
 
 def _full(triangle: Rows) -> Array:

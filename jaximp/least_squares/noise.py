@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Num, Shaped
 
+from jaximp.numerics.compilation import require_numbers
 from jaximp.types import AnyArray, Numbers
 
 NEGLIGIBLE = 1e-6
@@ -62,8 +63,8 @@ class Noise:
     """(L,) autocovariance by lag, in rows, as `signals.autocovariance` computes it from the filters; a single one for
     rows that are white."""
     autoregression: tuple[Numbers, ...] = ()
-    """For each output the coefficients (k,) of an autoregression, where the noise before the filters was not white.
-    Empty: the noise was white."""
+    """For each output the coefficients (k,) by which the rows that the filters made of it followed from those before:
+    what went through the filters was not white. Empty: it was white."""
 
     def __post_init__(self) -> None:
         r = np.asarray(self.autocovariance, float)
@@ -147,6 +148,7 @@ def whiten(
 
     **Source:** generalised least squares (Aitken 1936) by a banded Cholesky factor.
     """
+    require_numbers("whiten", "whiten the rows before", W, y, noise, valid)
     W, y = np.asarray(W, float), np.asarray(y, float)
     noise = noise if isinstance(noise, Noise) else Noise() if noise is None else Noise(np.asarray(noise))
     valid = np.ones(y.shape, bool) if valid is None else np.asarray(valid, bool)
@@ -183,6 +185,7 @@ def fit_noise(
     some of the slow noise, and what it took is given back: `e e'` is expected to be `r r' + W V W'`, with the residuals
     r and the covariance V of the optimum (expectation maximisation of the restricted likelihood, Laird and Ware 1982).
     """
+    require_numbers("fit_noise", "fit the noise before", W, y, noise, valid)
     noise = noise if isinstance(noise, Noise) else Noise() if noise is None else Noise(np.asarray(noise))
     plain = found = replace(noise, autoregression=())
     rows = whiten(W, y, plain, valid)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num, Shaped
 
 from jaximp.least_squares.window import check_finite
-from jaximp.numerics.compilation import compiled, keep
+from jaximp.numerics.compilation import compiled, is_traced, keep
 from jaximp.numerics.lanes import Rows, cholesky, substitute
 from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
@@ -74,7 +74,7 @@ def recursive_least_squares(
     W, y = jnp.asarray(W, float), jnp.asarray(y, float)
     if W.ndim != 2 or y.shape != W.shape[:1]:
         raise ValueError(f"W has shape {W.shape} and y {y.shape}: expected (N, p) and (N,)")
-    if not isinstance(forgetting, jax.core.Tracer) and not 0 < forgetting <= 1:
+    if not is_traced(forgetting) and not 0 < forgetting <= 1:
         raise ValueError(f"the forgetting factor is {forgetting}: it must lie in (0, 1]")
     valid = jnp.ones(len(y), bool) if valid is None else jnp.asarray(valid, bool)
     if valid.shape != y.shape:

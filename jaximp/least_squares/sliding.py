@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +35,7 @@ from jaximp.least_squares.window import (
     solve_window,
     variance_accounted_for,
 )
-from jaximp.numerics.compilation import compiled
+from jaximp.numerics.compilation import compiled, is_traced, require_numbers
 from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray
 
@@ -51,7 +51,9 @@ def window_starts(n_samples: int, window: int, step: int = 1) -> NDArray[np.int6
     """First sample of every window that fits into the recording."""
     for name, value in (("window", window), ("step", step)):
         if not isinstance(value, int | np.integer):
-            raise ValueError(f"{name} is {value!r}: it must be a whole number of samples")
+            raise ValueError(
+                f"{name} is {value!r}: it must be a whole number of samples; pass sample_rate to give it in seconds"
+            )
         if value <= 0:
             raise ValueError(f"{name} is {value}: it must be at least one sample")
     if window > n_samples:
@@ -89,19 +91,15 @@ def sliding_least_squares(
 
     **Source:** Tout et al. 2023, III-B.
     """
-    require_float64(W, y)
-    window, step = in_samples("window", window, sample_rate), in_samples("step", step, sample_rate)
-    W, y, scale = _checked(W, y, valid, weights, window)
-    starts = window_starts(len(W), window, step)
-    n_windows = len(starts)
-    noise = None if noise is None else jnp.asarray(noise, W.dtype)
-    if n_windows * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
-        found = _in_chunks(W, y, scale, window, step, noise)
-        if found is not None:
-            return found
+    given = _given(W, y, window, step, sample_rate, valid, weights)
+    noise = noise if noise is None or is_traced(noise) else np.asarray(noise, given.W.dtype)
+    found = _in_chunks(given, noise)
+    if found is not None:
+        return found
+    starts, n_windows = given.starts, len(given.starts)
     if room is not None:
-        starts = np.pad(starts, (0, len(W) // step + 1 - n_windows), mode="edge")
-    fit = _solve_all(W, y, scale, noise, jnp.asarray(starts), window, room or window)
+        starts = np.pad(starts, (0, len(given.W) // given.step + 1 - n_windows), mode="edge")
+    fit = _solve_all(*given[:3], noise, jnp.asarray(starts), given.window, room or given.window)
     return fit if room is None else _first_windows(fit, n_windows)
 
 
@@ -116,14 +114,11 @@ def sliding_theta(
     weights: Num[AnyArray, "..."] | None = None,
 ) -> Float[AnyArray, "M p"]:
     """The estimates of `sliding_least_squares` alone, in a third of its time."""
-    require_float64(W, y)
-    window, step = in_samples("window", window, sample_rate), in_samples("step", step, sample_rate)
-    W, y, scale = _checked(W, y, valid, weights, window)
-    if len(window_starts(len(W), window, step)) * window * math.prod(W.shape[1:]) > FROM_CHUNKS:
-        found = _in_chunks(W, y, scale, window, step, statistics=False)
-        if found is not None:
-            return found
-    return sliding_least_squares(W, y, window, step, valid=valid, weights=weights).theta
+    given = _given(W, y, window, step, sample_rate, valid, weights)
+    found = _in_chunks(given, statistics=False)
+    if found is not None:
+        return found
+    return _solve_all(*given[:3], None, jnp.asarray(given.starts), given.window, given.window).theta
 
 
 def sliding_pieces(
@@ -146,7 +141,7 @@ def sliding_pieces(
     """
     window, step = in_samples("window", window, sample_rate), in_samples("step", step, sample_rate)
     window_starts(window, window, step)
-    checked = (_checked(W, y, valid[0] if valid else None, None, window) for W, y, *valid in pieces)
+    checked = (_checked_piece(window, *piece) for piece in pieces)
     beginning = next(checked, None)
     if beginning is None:
         raise ValueError("there are no samples: give at least one piece")
@@ -196,14 +191,15 @@ def adaptive_least_squares(
     window_starts(len(W), shortest, step)
     if longest < shortest:
         raise ValueError(f"longest is {longest} samples and shortest {shortest}: lengthen the longest window")
-    stderr = np.asarray(stderr, W.dtype)
-    if stderr.shape != W.shape[-1:] or not (stderr > 0).all():
-        raise ValueError(f"stderr has shape {stderr.shape}: give {W.shape[-1]} numbers above zero, one per parameter")
+    stderr, cond = (x if is_traced(x) else np.asarray(x, W.dtype) for x in (stderr, cond))
+    shape, p = np.shape(stderr), W.shape[-1]
+    if shape != (p,) or not (is_traced(stderr) or (stderr > 0).all()):
+        raise ValueError(f"stderr has shape {shape}: give {p} numbers above zero, one per parameter")
     n, few, most = math.prod(y.shape[1:]), -(-shortest // step), -(-longest // step)
     count = 1 + math.ceil(math.log(most / few) / math.log(1.05))
     lengths = np.unique(np.geomspace(few, most, count).round().astype(int))
     noise = _noise_in_sums(noise, shortest, n, "a fixed window")
-    task = make_adaptive_task(lengths, step * n, n, stderr, np.asarray(cond, W.dtype), noise, scale.dtype != bool)
+    task = make_adaptive_task(lengths, step * n, n, stderr, cond, noise, scale.dtype != bool)
     return jax.tree.map(lambda x: x[few - 1 :], _from_shared_sums(W, y, scale, task))
 
 
@@ -220,6 +216,7 @@ def in_samples(name: str, value: float | None, sample_rate: float | None) -> int
 
 def _noise_in_sums(noise: AnyArray | None, window: int, outputs: int, instead: str) -> NDArray[Any] | None:
     """The lags of the noise's autocovariance that count, where only the shared sums can serve."""
+    require_numbers("noise", "its lags decide what is compiled, so pass it as a constant", noise)
     lags = lags_for_sums(None if noise is None else np.asarray(noise), window * outputs, outputs)
     if lags is None:
         raise ValueError(
@@ -228,11 +225,38 @@ def _noise_in_sums(noise: AnyArray | None, window: int, outputs: int, instead: s
     return None if noise is None else np.asarray(noise)[:lags]
 
 
-def _in_chunks(
-    W: Array, y: Array, scale: Array, window: int, step: int, noise: Array | None = None, statistics: bool = True
-) -> Any:
-    """Many windows, from sums that they share; None where the noise does not allow that."""
-    n, n_windows = math.prod(y.shape[1:]), (len(W) - window) // step + 1
+class _Given(NamedTuple):
+    """What all kinds of sliding windows are asked for, checked."""
+
+    W: Array
+    y: Array
+    scale: Array
+    window: int
+    step: int
+    starts: NDArray[np.int64]
+
+
+def _given(
+    W: AnyArray,
+    y: AnyArray,
+    window: float,
+    step: float | None,
+    sample_rate: float | None,
+    valid: AnyArray | None,
+    weights: AnyArray | None,
+) -> _Given:
+    require_float64(W, y)
+    window, step = in_samples("window", window, sample_rate), in_samples("step", step, sample_rate)
+    arrays = _checked(W, y, valid, weights, window)
+    return _Given(*arrays, window, step, window_starts(len(arrays[0]), window, step))
+
+
+def _in_chunks(given: _Given, noise: Array | None = None, statistics: bool = True) -> Any:
+    """Many windows, from sums that they share; None where they are few, or the noise does not allow that."""
+    W, y, scale, window, step, starts = given
+    n, n_windows = math.prod(y.shape[1:]), len(starts)
+    if n_windows * window * math.prod(W.shape[1:]) <= FROM_CHUNKS:
+        return None
     lags = lags_for_sums(noise, window * n, n)
     if lags is None:
         return None
@@ -244,11 +268,9 @@ def _in_chunks(
 
 def _from_shared_sums(W: Array, y: Array, scale: Array, task: Task) -> Any:
     """All windows of a task, on all cores in numpy's memory, or inside somebody's compiled program."""
-    return solve_traced(_rows(W, y, scale), task) if _traced(W, y, scale) else solve_all(_as_piece(W, y, scale), task)
-
-
-def _traced(*arrays: Array) -> bool:
-    return any(isinstance(x, jax.core.Tracer) for x in arrays) or jax.default_backend() != "cpu"
+    if is_traced(W, y, scale, task.wanted) or jax.default_backend() != "cpu":
+        return solve_traced(_rows(W, y, scale), task)
+    return solve_all(_as_piece(W, y, scale), task)
 
 
 def _rows(W: AnyArray, y: AnyArray, scale: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
@@ -262,7 +284,7 @@ def _as_piece(W: Array, y: Array, scale: Array) -> Piece:
 
 def _first_windows(tree: Any, n_windows: int) -> Any:
     """Without the windows that were only there to share compiled code; slicing in numpy compiles nothing."""
-    return jax.tree.map(lambda x: x[:n_windows] if isinstance(x, jax.core.Tracer) else np.asarray(x)[:n_windows], tree)
+    return jax.tree.map(lambda x: x[:n_windows] if is_traced(x) else np.asarray(x)[:n_windows], tree)
 
 
 @partial(compiled, static_argnames="room")
@@ -358,6 +380,11 @@ def _score_all(W: Array, y: Array, valid: Array, theta: Array, start: Array, win
     return map_windows(one, (theta, start), room * math.prod(W.shape[1:]))
 
 
+def _checked_piece(window: int, W: AnyArray, y: AnyArray, valid: AnyArray | None = None) -> tuple[Array, Array, Array]:
+    require_numbers("sliding_pieces", "pass the whole recording to sliding_least_squares", W, y, valid)
+    return _checked(W, y, valid, None, window)
+
+
 def _checked(
     W: AnyArray, y: AnyArray, valid: AnyArray | None, weights: AnyArray | None, window: int
 ) -> tuple[Array, Array, Array]:
@@ -381,7 +408,7 @@ def _checked(
     check_finite(W, y, scale)
     if weights is not None:
         weights = like_y("weights", jnp.asarray(weights, W.dtype))
-        if not isinstance(weights, jax.core.Tracer) and not bool((jnp.isfinite(weights) & (weights >= 0))[scale].all()):
+        if not is_traced(weights, scale) and not bool((jnp.isfinite(weights) & (weights >= 0))[scale].all()):
             raise ValueError("weights must be finite and not negative: give zero to a sample that is not to count")
         scale = root_of_weights(weights, scale)
     return W, y, scale

@@ -6,6 +6,8 @@ window is solved by a QR decomposition, so that its condition number enters once
 
 from __future__ import annotations
 
+from typing import Any, overload
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, Shaped
 from numpy.typing import NDArray
 
-from jaximp.numerics.linear_algebra import inverse_of_triangle, orthonormal, singular_values
+from jaximp.numerics.compilation import is_traced, require_numbers
+from jaximp.numerics.linear_algebra import inverse_of_triangle, orthonormal, root, singular_values
 from jaximp.types import AnyArray
 
 DENSE_ROWS = 512
@@ -100,32 +103,32 @@ def solve_window(W: AnyArray, y: AnyArray, scale: AnyArray, noise: AnyArray | No
     n, weight = (scale > 0).sum().astype(W.dtype), scale**2
 
     Q, R, independent = orthonormal(rows)
-    singular = singular_values(R)
     solvable = (n >= p) & independent
-    inverse = inverse_of_triangle(jnp.where(solvable, R, jnp.eye(p, dtype=R.dtype)))
+    R = jnp.where(solvable, R, jnp.eye(p, dtype=R.dtype))  # what is not solvable must not make derivatives NaN
+    singular, inverse = singular_values(R), inverse_of_triangle(R)
     theta = inverse @ (Q.T @ torque)
     residual = torque - rows @ theta
     rss = residual @ residual
 
     if noise is None:
         dof = n - p
-        spread = jnp.eye(p, dtype=R.dtype) * rss / jnp.where(dof > 0, dof, jnp.nan)
+        spread = jnp.eye(p, dtype=R.dtype) * rss / jnp.where(dof > 0, dof, 1)
     else:
         spread, dof = _coloured(Q, rss, scale.reshape(n_samples, -1), jnp.asarray(noise))
 
-    def or_nan(value: Array) -> Array:
-        return jnp.where(solvable, value, jnp.nan)
+    def or_nan(value: Array, known: Array = solvable) -> Array:
+        return jnp.where(known, value, jnp.nan)
 
-    covariance = inverse @ spread @ inverse.T
+    covariance, spread_known = inverse @ spread @ inverse.T, solvable & ((dof > 0) | (noise is not None))
     return WindowFit(
         theta=or_nan(theta),
-        stderr=or_nan(jnp.sqrt(jnp.diagonal(covariance))),
-        covariance=or_nan(covariance),
+        stderr=or_nan(root(jnp.diagonal(covariance)), spread_known),
+        covariance=or_nan(covariance, spread_known),
         dof=or_nan(dof),
         cond=or_nan(singular[0] / singular[-1]),
         sigma_min=or_nan(singular[-1]),
         excitation=or_nan(1 / jnp.linalg.norm(inverse, axis=1)),
-        residual_rms=or_nan(jnp.sqrt(rss / weight.sum())),
+        residual_rms=or_nan(root(rss / jnp.where(n > 0, weight.sum(), 1))),
         vaf=or_nan(variance_accounted_for(y, y - W @ theta, weight)),
         samples=n.astype(int),
     )
@@ -148,7 +151,7 @@ def scatter(x: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]) -> Float[Ar
 
 def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:
     """Refuse numbers that are not finite where `valid` does not exclude them; while tracing nothing is known yet."""
-    if any(isinstance(array, jax.core.Tracer) for array in (W, y, valid)):
+    if is_traced(W, y, valid):
         return
     W, y = np.asarray(W), np.asarray(y)
     if np.isfinite(W).all() and np.isfinite(y).all():
@@ -159,12 +162,38 @@ def check_finite(W: AnyArray, y: AnyArray, valid: AnyArray) -> None:
         raise ValueError(f"{bad} samples of W or y are not finite: mark them with valid=False, or mend them")
 
 
+@overload
+def confidence_interval(fit: Any, level: float = 0.95, /) -> tuple[NDArray[np.float64], NDArray[np.float64]]: ...
+
+
+@overload
 def confidence_interval(
     theta: Num[AnyArray, "*M p"], stderr: Num[AnyArray, "*M p"], dof: Num[AnyArray, "*M"], level: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]: ...
+
+
+def confidence_interval(
+    theta: Any, stderr: Any = None, dof: Any = None, level: float = 0.95
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper end of the interval that holds the truth with probability `level`, from Student's t."""
+    """Lower and upper end of the interval that holds the truth with probability `level`, from Student's t.
+
+    Of a fit, `confidence_interval(fit, level)`, or of numbers, `confidence_interval(theta, stderr, dof, level)`.
+
+    **Arguments:** `fit` anything with `theta`, `stderr` and `dof`; or these: (..., p), (..., p) and (...).
+
+    **Raises:** `ValueError` for a level that is no probability, and inside `jit`, `vmap` and `grad`: Student's quantile
+    is scipy's.
+    """
+    if hasattr(theta, "stderr"):
+        level = level if stderr is None else stderr
+        theta, stderr, dof = theta.theta, theta.stderr, theta.dof
+    require_numbers("confidence_interval", "call it on the results", theta, stderr, dof, level)
     from scipy.stats import t
 
+    if stderr is None or dof is None:
+        raise ValueError("confidence_interval needs a fit, or theta with its stderr and dof")
+    if not 0 < level < 1:
+        raise ValueError(f"the level is {level}: it must be a probability between 0 and 1, such as 0.95")
     half = t.ppf(0.5 + level / 2, np.asarray(dof))[..., None] * np.asarray(stderr)
     return np.asarray(theta) - half, np.asarray(theta) + half
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.arm import two_numbers
 from jaximp.models.joint import sine_and_cosine
+from jaximp.numerics.compilation import is_traced
 from jaximp.numerics.linear_algebra import solve_pair
 from jaximp.types import AnyArray
 
@@ -118,7 +118,7 @@ class ArmGeometry(eqx.Module):
         beyond, within = (l1 + l2) ** 2 - squared, squared - (l1 - l2) ** 2
         slack = ROUNDING * float(jnp.finfo(jnp.result_type(x, float)).eps) * (l1 + l2) ** 2
         unreachable = (beyond < -slack) | (within < -slack)
-        if not isinstance(unreachable, jax.core.Tracer) and bool(unreachable.any()):
+        if not is_traced(unreachable) and bool(unreachable.any()):
             raise ValueError(self._out_of_reach(np.asarray(x), np.asarray(unreachable)))
         # Twice the forearm in the frame of the upper arm; across it by Heron's formula for the area of the triangle.
         along = (squared - l1**2 - l2**2) / l1

@@ -37,6 +37,20 @@ def options() -> dict[str, Any]:
     return WANTED
 
 
+def is_traced(*trees: Any) -> bool:
+    """Whether `jit`, `vmap` or `grad` is at work on any of these: then their values are not known."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def require_numbers(name: str, instead: str, *trees: Any) -> None:
+    """Refuse what is traced, in one line, where a function needs values.
+
+    **Raises:** `ValueError` with what to do `instead`.
+    """
+    if is_traced(*trees):
+        raise ValueError(f"{name} needs numbers, which are not known inside jit, vmap and grad: {instead}")
+
+
 def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
     """`jax.jit(function, **settings)`, made when it is first called: only then the device is known.
 
@@ -54,8 +68,7 @@ def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         nonlocal refused
         # Within `jit` every new array is traced, within `vmap` or `grad` the arguments are.
-        seen = (jnp.zeros(()), *jax.tree.leaves((args, kwargs)))
-        if refused or any(isinstance(leaf, jax.core.Tracer) for leaf in seen):
+        if refused or is_traced(jnp.zeros(()), args, kwargs):
             return plain(*args, **kwargs)
         try:
             return tuned()(*args, **kwargs)

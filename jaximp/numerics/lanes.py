@@ -49,7 +49,10 @@ def sum_of(terms: Iterable[Array]) -> Array:
 
 
 def cholesky(sums: Rows) -> Rows:
-    """Upper triangle with `R'R` the given matrix, row by row; a pivot that is not positive becomes one."""
+    """Upper triangle with `R'R` the given matrix, row by row.
+
+    The row of a pivot that is not positive is meaningless, but finite.
+    """
     triangle: list[Array] = []
     for j, row in enumerate(sums):
         rest = row
@@ -59,6 +62,11 @@ def cholesky(sums: Rows) -> Rows:
     return tuple(triangle)
 
 
+def divided(x: Array | float, pivot: Array) -> Array:
+    """`x / pivot`, and x where the pivot is zero: meaningless there, but finite, and so is its derivative."""
+    return x / jnp.where(pivot == 0, 1, pivot)
+
+
 def substitute(triangle: Rows, p: int) -> list[Array]:
     """Back through a triangle of p rows whose last column is the right-hand side: the p unknowns."""
     inner: list[Array] = list(triangle[:p])
@@ -66,7 +74,7 @@ def substitute(triangle: Rows, p: int) -> list[Array]:
         rest = triangle[i][p - i]
         for k in range(i + 1, p):
             rest = rest - triangle[i][k - i] * inner[k]
-        inner[i] = keep(rest / triangle[i][0])
+        inner[i] = keep(divided(rest, triangle[i][0]))
     return inner
 
 
@@ -113,7 +121,7 @@ def null_vectors(matrix: Float[Array, "p p lanes"]) -> Float[Array, "p lanes"]:
     v = jnp.asarray(1 + 0.1 * np.sin(np.arange(1.0, p + 1)), matrix.dtype)[:, None] * jnp.ones_like(matrix[0])
     for _ in range(3):
         x = jnp.stack(substitute(cholesky(as_rows(matrix, v)), p))
-        v = x / jnp.sqrt((x**2).sum(axis=0))
+        v = divided(x, jnp.sqrt((x**2).sum(axis=0)))
     return v
 
 
@@ -151,9 +159,10 @@ def extreme_singular_values(
 def _derivative_of_singular_values(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
     (triangle, inverse), (change, _) = primals, tangents
     high, low = extreme_singular_values(triangle, inverse)
-    right = _of_largest(_gram(triangle), high**2), _of_largest(_inverse_gram(inverse), 1 / low**2)
-    left = (triangle * right[0]).sum(axis=1) / high, (inverse * right[1][:, None]).sum(axis=0) * low
-    return (high, low), tuple((u * (change * v).sum(axis=1)).sum(axis=0) for u, v in zip(left, right, strict=True))
+    right = _of_largest(_gram(triangle), high**2), _of_largest(_inverse_gram(inverse), divided(1.0, low**2))
+    left = divided((triangle * right[0]).sum(axis=1), high), (inverse * right[1][:, None]).sum(axis=0) * low
+    slopes = [(u * (change * v).sum(axis=1)).sum(axis=0) for u, v in zip(left, right, strict=True)]
+    return (high, low), (slopes[0], slopes[1])
 
 
 def _gram(triangle: Array) -> Array:

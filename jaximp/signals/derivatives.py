@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -89,7 +90,7 @@ def savitzky_golay(
     """A derivative of a sampled signal, of polynomials that are fitted around every sample; `derivative=0` smooths.
 
     At both ends the polynomial of the first or last whole window is evaluated off its middle, which passes much noise:
-    leave out `savitzky_golay_half_length` samples there, and around gaps.
+    leave out `savitzky_golay_half_length` samples there, and around gaps. That of a numpy array is a numpy array.
 
     The numbers are those of `scipy.signal.savgol_filter`, which cannot be used here: it fits powers of the sample's
     index, and with order 7 and 203 samples (50 Hz at 4 kHz) its least squares cuts off the highest of them.
@@ -98,20 +99,25 @@ def savitzky_golay(
 
     **Source:** Savitzky and Golay 1964; order and cut-off as in Börner et al. 2020, 2.4.1.
     """
-    from scipy.signal import oaconvolve
-
-    x = np.asarray(x, np.float64)
     half = savitzky_golay_half_length(sample_rate, cutoff, order)
     if len(x) < 2 * half + 1:
         raise ValueError(f"{len(x)} samples are too few for this filter, which has {2 * half + 1}: record longer")
     weights = _polynomial_weights(half, order, derivative) * (sample_rate / half) ** derivative
-    columns = x.reshape(len(x), -1)
+    if isinstance(x, jax.Array):
+        one = partial(jax.scipy.signal.fftconvolve, mode="valid")
+        concatenate, convolve = jnp.concatenate, jax.vmap(one, in_axes=(1, None), out_axes=1)
+        weights = weights.astype(jnp.result_type(x, float))
+    else:
+        from scipy.signal import oaconvolve
+
+        x, concatenate, convolve = np.asarray(x), np.concatenate, lambda x, w: oaconvolve(x, w[:, None], "valid", 0)
+    columns = x.reshape(len(x), -1).astype(weights.dtype)
     shift = columns[:1] if derivative else 0.0  # a large constant would cost digits
-    middle = oaconvolve(columns - shift, weights[half][::-1, None], mode="valid", axes=0)
+    middle = convolve(columns - shift, weights[half][::-1])
     start, end = (weights[part] @ (ends - shift) for part, ends in (
         (slice(None, half), columns[: 2 * half + 1]), (slice(half + 1, None), columns[-2 * half - 1 :])
     ))  # fmt: skip
-    return np.concatenate([start, middle, end]).reshape(x.shape)
+    return concatenate([start, middle, end]).reshape(x.shape)
 
 
 def savitzky_golay_gain(sample_rate: float, derivative: int, cutoff: float = 50.0, order: int = 7) -> float:
