@@ -1,0 +1,12 @@
+from .erden_billard import state_at_onset as state_at_onset
+from .feedback_jerk import cutoff_frequencies as cutoff_frequencies
+from .feedback_jerk import energy_spectra as energy_spectra
+from .feedback_jerk import feedback_jerk_isolation as feedback_jerk_isolation
+from .gomi_kawato import mean_of_perturbed as mean_of_perturbed
+from .isolated import Impedance as Impedance
+from .isolated import Isolated as Isolated
+from .methods import METHODS as METHODS
+from .methods import Method as Method
+from .methods import isolate as isolate
+from .output_error import OutputErrorFit as OutputErrorFit
+from .output_error import learned_continuation as learned_continuation
