@@ -19,7 +19,7 @@ from jaximp import ArmImpedance, identify_impedance, parse_job, read_job
 from jaximp.jobs.run_trials import identify_trials
 from jaximp.models import BaseInertia
 from jaximp.perturbation.deviations import KnownArm
-from jaximp.perturbation.isolation import METHODS
+from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.simulation.arm_recordings import write_arm_recordings
 
 jax.config.update("jax_enable_x64", True)

@@ -24,8 +24,8 @@ from jaximp.perturbation import fit
 from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
 from jaximp.perturbation.estimate import ArmEstimate
 from jaximp.perturbation.impedance import ArmImpedance, identify_impedance
-from jaximp.perturbation.isolation import METHODS, Method
 from jaximp.perturbation.isolation.isolated import Impedance, Isolated
+from jaximp.perturbation.isolation.methods import METHODS, Method
 from jaximp.perturbation.sensors import handle_disagreement
 from jaximp.perturbation.trials import Handle, Trials
 from jaximp.perturbation.windows import at_other_windows

@@ -1,10 +1,10 @@
-from . import isolation as isolation
 from .deviations import Deviations as Deviations
 from .deviations import JointDeviations as JointDeviations
 from .deviations import KnownArm as KnownArm
 from .deviations import joint_deviations as joint_deviations
 from .impedance import ArmImpedance as ArmImpedance
 from .impedance import identify_impedance as identify_impedance
+from .isolation.methods import METHODS as METHODS
 from .onsets import find_onset as find_onset
 from .reading import read_trials as read_trials
 from .regression import JointTrials as JointTrials
