@@ -21,9 +21,10 @@ from typing import Any
 from jaximp.design.excitation import Limits
 from jaximp.identification.filters import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
+from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.design import DesignSettings, EncoderSettings
-from jaximp.jobs.job import ArmSettings, HumanSettings, Job, ModelSettings, ReflexSettings, RobotSettings
-from jaximp.jobs.trials import STATIC_WINDOW, HandArmSettings, HandleSettings, TrialsSettings, TriggerSettings
+from jaximp.jobs.job import HumanSettings, Job, ModelSettings, ReflexSettings, RobotSettings
+from jaximp.jobs.trials import STATIC_WINDOW, HandleSettings, TrialsSettings, TriggerSettings
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import load_recording
@@ -65,7 +66,12 @@ RECORDING_JOB = (
     Table("[model.human]", HumanSettings, "A human joint: inertia, damping, stiffness and offset torque."),
     Table("[model.human.reflex]", ReflexSettings, "The stretch reflex of a human joint."),
     Table("[model.robot]", RobotSettings, "A robot's joint: its inertia, gravity and friction."),
-    Table("[model.arm]", ArmSettings, "An arm of two joints in a plane. It stands alone: without human and robot."),
+    Table(
+        "[model.arm]",
+        ArmSettings,
+        "An arm of two joints in a plane. It stands alone: without human and robot.",
+        hidden=OF_HAND,
+    ),
     Table("[filter]", FilterSettings, "Filters of position and torque, all run forward and backward."),
     Table("[window]", WindowSettings),
     Table("[trust]", TrustLimits),
@@ -93,7 +99,8 @@ TRIALS_JOB = (
         only=("files", "file", "trial", "onset", "window"),
         window=STATIC_WINDOW,
     ),
-    Table("[model.arm] beside [trials]", HandArmSettings, "The arm whose hand was recorded."),
+    Table("[model.arm] beside [trials]", ArmSettings, "The arm whose hand was recorded.", hidden=OF_JOINTS),
+    Table("[model.arm.inertia] and [model.arm.inertia_stderr]", InertiaSettings, "Base inertia of the arm."),
 )
 DESIGN_JOB = (
     Table("[design]", DesignSettings, "The motion that is wanted."),

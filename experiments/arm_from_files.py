@@ -10,36 +10,41 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaximp import ArmImpedance, identify_impedance, identify_trials, parse_job, read_job
-from jaximp.perturbation.isolation import METHODS, KnownArm
-from jaximp.simulation import write_arm_recordings
+from jaximp import ArmImpedance, identify_impedance, parse_job, read_job
+from jaximp.jobs.run_trials import identify_trials
+from jaximp.models import BaseInertia
+from jaximp.perturbation.deviations import KnownArm
+from jaximp.perturbation.isolation.methods import METHODS
+from jaximp.simulation.arm_recordings import write_arm_recordings
 
 jax.config.update("jax_enable_x64", True)
 
 SEEDS = 20
+MATRICES = {"damping": "damping_Nms_per_rad", "stiffness": "stiffness_Nm_per_rad"}
 OF_FILTERS = 5
 """Seeds of which the filters' share is told as well."""
 
 
-def compared(found: ArmImpedance, truth: dict[str, list[list[float]]]) -> dict[str, float]:
+def compared(found: ArmImpedance, truth: dict[str, Any]) -> dict[str, float]:
     """Each element: error as a share of the truth, standard error likewise, and whether the interval holds it."""
     low, high = found.interval()
     row = {}
     for k, name in enumerate(found.names):
-        matrix = truth["damping_Nms_per_rad" if name[0] == "D" else "stiffness_Nm_per_rad"]
-        true = matrix[int(name[1]) - 1][int(name[2]) - 1]
+        matrix, place = name.split("_")
+        true = truth[MATRICES[matrix]][int(place[0]) - 1][int(place[1]) - 1]
         row |= {
             name: found.theta[k] / true - 1,
             f"{name}_stderr": found.stderr[k] / true,
             f"{name}_held": float(low[k] <= true <= high[k]),
         }
-    for letter, matrix in (("D", "damping_Nms_per_rad"), ("K", "stiffness_Nm_per_rad")):
-        true_matrix = np.array(truth[matrix])
-        row[f"{letter}_norm"] = np.linalg.norm(getattr(found, letter) - true_matrix) / np.linalg.norm(true_matrix)
+    for matrix, values in (("damping", found.D), ("stiffness", found.K)):
+        true_matrix = np.array(truth[MATRICES[matrix]])
+        row[f"{matrix}_norm"] = np.linalg.norm(values - true_matrix) / np.linalg.norm(true_matrix)
     return row | {"trusted": float(found.trusted)}
 
 
@@ -58,8 +63,9 @@ def main() -> None:
             assert trials is not None
             for smooth in (True, False) if seed < OF_FILTERS else ():
                 perturbed, unperturbed, _ = trials.load(smooth)
+                named = {name.removesuffix("_inertia"): value for name, value in truth["inertia_kgm2"].items()}
                 for method in METHODS:
-                    arm = KnownArm(result.main.arm.geometry, np.array(truth["inertia_kgm2"]), trials.handle.make())
+                    arm = KnownArm(result.main.arm.geometry, BaseInertia(**named), trials.handle.make())
                     found = identify_impedance(perturbed, unperturbed, arm, method)
                     label = f"{method}, inertia known, {'smoothed' if smooth else 'as measured'}"
                     rows.setdefault(label, []).append(compared(found, truth))

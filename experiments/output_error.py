@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from scipy.signal import butter, savgol_filter, sosfilt
 
 from jaximp.models import ArmGeometry
-from jaximp.perturbation import Movements, static_inertia
-from jaximp.perturbation.output_error import OutputErrorFit, output_error
+from jaximp.perturbation.isolation.output_error import OutputErrorFit, output_error
+from jaximp.perturbation.static import static_inertia
+from jaximp.perturbation.trials import Trials
 from jaximp.simulation.neuromuscular import (
     ANGLES,
     POSTURES,
@@ -70,22 +71,22 @@ def simulate(key: jax.Array, duration: float, extra: jax.Array | None = None) ->
 
 
 @eqx.filter_jit
-def postures(key: jax.Array) -> Movements:
+def postures(key: jax.Array) -> Trials:
     """100 trials of the static task."""
     noise = neural_noise(jax.random.split(key, 4)[3], 100, round(1.5 * RATE))
     return hold_posture(ARM, np.repeat(POSTURES, 20, axis=0), np.tile(ANGLES, 5), noise)
 
 
-class Trials(NamedTuple):
+class Simulated(NamedTuple):
     """One experiment."""
 
-    perturbed: Movements
-    unperturbed: Movements
+    perturbed: Trials
+    unperturbed: Trials
     K: Numbers
     """(60, 3) mean true stiffness in the window."""
 
 
-def experiment(seed: int, duration: float, tremor: float = 0.0) -> Trials:
+def experiment(seed: int, duration: float, tremor: float = 0.0) -> Simulated:
     """Simulated, and cut around the onset. `tremor`: standard deviation of more noise, between 7 and 9 Hz."""
     extra = None
     if tremor:
@@ -100,18 +101,18 @@ def experiment(seed: int, duration: float, tremor: float = 0.0) -> Trials:
     within = onset[TRIALS : 2 * TRIALS, None] + np.arange(WINDOW + 1)
     K = found.stiffness[trial[TRIALS : 2 * TRIALS], within].mean(axis=1)
 
-    def some(which: slice) -> Movements:
-        return Movements(*(x[which] for x in signals), np.full(len(onset[which]), BEFORE, np.int32), RATE)
+    def some(which: slice) -> Trials:
+        return Trials(*(x[which] for x in signals), np.full(len(onset[which]), BEFORE, np.int32), RATE)
 
-    return Trials(some(slice(0, TRIALS)), some(slice(2 * TRIALS, None)), K)
+    return Simulated(some(slice(0, TRIALS)), some(slice(2 * TRIALS, None)), K)
 
 
 # What is done to the trials before the fit.
 
-Change = Callable[[Trials, np.random.Generator], Trials]
+Change = Callable[[Simulated, np.random.Generator], Simulated]
 
 
-def as_simulated(trials: Trials, generator: np.random.Generator) -> Trials:
+def as_simulated(trials: Simulated, generator: np.random.Generator) -> Simulated:
     return trials
 
 
@@ -123,7 +124,7 @@ def measured(deviation: float = 0.0, step: float = 0.0, width: int = 161) -> Cha
     """White noise of the position or rounding to a step [m]; velocity and acceleration are derived from what is left,
     by polynomials of fifth order over `width` samples."""
 
-    def of(movements: Movements, generator: np.random.Generator) -> Movements:
+    def of(movements: Trials, generator: np.random.Generator) -> Trials:
         x = movements.position + deviation * generator.normal(size=movements.position.shape)
         x = np.round(x / step) * step if step else x
         v, a = (savgol_filter(x, width, 5, deriv=d, delta=1 / RATE, axis=1) for d in (1, 2))
@@ -212,7 +213,7 @@ def run(cases: tuple[Case, ...]) -> dict[str, Any]:
     for k in range(max(case.simulations for case in cases)):
         seed = FIRST_SEED + k
         inertia[k] = np.asarray(static_inertia(postures(jax.random.key(seed)), GEOMETRY).inertia)
-        trials: dict[tuple[float, float], Trials] = {}
+        trials: dict[tuple[float, float], Simulated] = {}
         for case in (case for case in cases if k < case.simulations):
             kind = case.duration, case.tremor
             if kind not in trials:

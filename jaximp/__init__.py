@@ -17,9 +17,9 @@ MOVED = {
     "jobs": "infer_recording infer_trials",
     "least_squares": "Noise RecursiveFit SlidingFit WindowFit fit_noise joined sliding_theta whiten",
     "motion": "FourierSeries MinimumJerk RaisedSine SixthOrder at_rest jerk",
-    "perturbation": "Handle KnownArm LinearFit Movements StiffnessFit fit_stiffness_linear fit_trials fit_triangles "
-    "fit_triangles_linear joint_trials judge_sensors load_trials merge_triangles predict_trials read_movements "
-    "read_postures read_trials regress_trials residual_triangle",
+    "perturbation": "Handle KnownArm LinearFit StiffnessFit fit_stiffness_linear fit_trials fit_triangles "
+    "fit_triangles_linear joint_trials judge_sensors load_trials merge_triangles predict_trials read_trials "
+    "regress_trials residual_triangle",
     "posterior": "ExactPosterior LogNormal MultivariateNormal Normal PosteriorMany adjusted derive estimate_density "
     "exact_posterior linear_density make_prior probability_greater sample_many "
     "stiffness_density summarise to_inference_data window_densities",

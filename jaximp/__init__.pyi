@@ -23,6 +23,7 @@ from .jobs.job import read_job as read_job
 from .jobs.run import identify as identify
 from .jobs.run import identify_recording as identify_recording
 from .jobs.run import infer as infer
+from .jobs.run_trials import identify_trials as identify_trials
 from .least_squares.recursive import recursive_least_squares as recursive_least_squares
 from .least_squares.sliding import adaptive_least_squares as adaptive_least_squares
 from .least_squares.sliding import sliding_least_squares as sliding_least_squares
@@ -30,7 +31,6 @@ from .least_squares.sliding import sliding_pieces as sliding_pieces
 from .least_squares.window import confidence_interval as confidence_interval
 from .perturbation.impedance import ArmImpedance as ArmImpedance
 from .perturbation.impedance import identify_impedance as identify_impedance
-from .perturbation.impedance import identify_trials as identify_trials
 from .perturbation.stiffness import fit_stiffness as fit_stiffness
 from .posterior.draws import Posterior as Posterior
 from .posterior.files import load_posterior as load_posterior

@@ -12,8 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from jaximp.models import (
+    BASE_INERTIA,
     ArmGeometry,
     ArmLinks,
+    BaseInertia,
     PlanarArm,
     RobotJoint,
     borner_from_lakatos,
@@ -140,6 +142,51 @@ def test_base_parameters_are_the_papers_in_both_conventions() -> None:
     random = np.random.default_rng(0).normal(size=(4, 5, 3))
     np.testing.assert_allclose(lakatos_from_borner(borner_from_lakatos(random)), random, atol=1e-15)
     np.testing.assert_allclose(borner_from_lakatos(lakatos_from_borner(random)), random, atol=1e-15)
+
+
+def test_base_inertia_has_names_in_place_of_an_order() -> None:
+    xi = BORNER.base_parameters()
+    named = BaseInertia.from_lakatos(xi)
+    (m1, m2), (c1, c2), (I1, I2), l1 = BORNER.masses, BORNER.centres, BORNER.inertias, BORNER.lengths[0]
+    assert named.upper_arm == pytest.approx(I1 + m1 * c1**2 + m2 * l1**2)
+    assert named.forearm == pytest.approx(I2 + m2 * c2**2)
+    assert named.coupling == pytest.approx(m2 * c2 * l1)
+    np.testing.assert_allclose(named.lakatos, xi, rtol=1e-12)
+    np.testing.assert_allclose(named.borner, borner_from_lakatos(xi), rtol=1e-12)
+    again = BaseInertia.from_borner(named.borner)
+    np.testing.assert_allclose(again.lakatos, xi, rtol=1e-12)
+    # What has names already is not read in any order again.
+    assert BaseInertia.from_borner(named) is named
+    assert BaseInertia.from_lakatos(named) is named
+    assert [f"{name}_inertia" for name in vars(named)] == list(BASE_INERTIA)
+    assert not set(BASE_INERTIA) & set(PlanarArm(REST).names)
+    batch = BaseInertia.from_lakatos(np.stack([xi, 2 * xi]))
+    np.testing.assert_allclose(batch.lakatos, [xi, 2 * xi], rtol=1e-12)
+
+
+@pytest.mark.parametrize("named", [BORNER.base_parameters(), np.stack([BORNER.base_parameters()] * 2)], ids=["", "two"])
+def test_a_body_that_can_be_is_let_through(named: Numbers) -> None:
+    found = BaseInertia.from_lakatos(named)
+    assert found.check() is found
+    assert jax.jit(lambda xi: BaseInertia.from_lakatos(xi).check().forearm)(named).shape == np.shape(named)[:-1]
+
+
+HEAVY_FOREARM = BaseInertia(upper_arm=0.1, forearm=0.09, coupling=0.01)
+
+
+@pytest.mark.parametrize(
+    "inertia",
+    [
+        pytest.param(lambda: BaseInertia.from_borner(HEAVY_FOREARM.lakatos), id="Lakatos's order as Borner's"),
+        pytest.param(lambda: BaseInertia.from_lakatos(np.array([0.05, 0.01, 0.09])), id="forearm above both"),
+        pytest.param(lambda: BaseInertia(0.1, 0.05, 0.08), id="indefinite"),
+        pytest.param(lambda: BaseInertia(0.1, 0.05, -0.01), id="negative"),
+        pytest.param(lambda: BaseInertia(0.1, np.nan, 0.01), id="not a number"),
+    ],
+)
+def test_no_body_has_such_an_inertia(inertia: Callable[[], BaseInertia]) -> None:
+    with pytest.raises(ValueError, match=r"no rigid body has the inertia upper_arm = .*check their order"):
+        inertia().check()
 
 
 def test_torque_is_that_of_borners_regressor() -> None:

@@ -237,7 +237,7 @@ torque = ["tau1", "tau2"]
 [model.arm]
 gravity = true
 zero = "hanging"
-length = 0.3
+lengths = [0.3]
 rotor = true
 viscous = true
 coulomb = true

@@ -10,21 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaximp.models.inertia import BaseInertia
 from jaximp.papers.arm_experiments import Case, Experiment, normalised_errors, run_case, true_deviations
-from jaximp.perturbation.isolation import (
-    METHODS,
-    Deviations,
-    JointDeviations,
-    KnownArm,
-    cutoff_frequencies,
-    feedback_jerk_isolation,
-    in_window,
-    joint_deviations,
-    mean_of_perturbed,
-    state_at_onset,
-    static_inertia,
-)
-from jaximp.perturbation.movements import Movements
+from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm, joint_deviations
+from jaximp.perturbation.isolation.erden_billard import state_at_onset
+from jaximp.perturbation.isolation.feedback_jerk import cutoff_frequencies, feedback_jerk_isolation
+from jaximp.perturbation.isolation.gomi_kawato import mean_of_perturbed
+from jaximp.perturbation.isolation.methods import METHODS
+from jaximp.perturbation.static import static_inertia
+from jaximp.perturbation.trials import Trials, in_window
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm
 
 ARM = NeuromuscularArm()
@@ -91,7 +85,7 @@ def impedance(joint: JointDeviations) -> tuple[np.ndarray, np.ndarray]:
     return found[:, :2], found[:, 2:]
 
 
-def damping_error(experiment: Experiment, found: Deviations, perturbed: Movements | None = None) -> np.ndarray:
+def damping_error(experiment: Experiment, found: Deviations, perturbed: Trials | None = None) -> np.ndarray:
     """Of the damping, in percent of its largest element, with the true inertia."""
     D, _ = impedance(joint_deviations(perturbed or experiment.perturbed, found, KNOWN))
     K11, K12, K22 = np.asarray(experiment.stiffness).mean(axis=0)
@@ -125,7 +119,7 @@ def test_integration_is_by_trapezia(experiment: Experiment, monkeypatch: pytest.
     def rectangles(x: Any, rate: float) -> Any:
         return jnp.cumsum(x, axis=1) / rate
 
-    monkeypatch.setattr("jaximp.perturbation.isolation._integral", rectangles)
+    monkeypatch.setattr("jaximp.perturbation.isolation.feedback_jerk._integral", rectangles)
     jax.clear_caches()
     wrong = feedback_jerk_isolation(experiment.perturbed, experiment.twins, KNOWN).deviations
     jax.clear_caches()
@@ -152,7 +146,24 @@ def test_noise_free_jerk_isolation_is_nearly_exact() -> None:
     assert shares(quiet, mean.deviations).max() < 1.0
 
 
+def test_a_known_arm_has_borners_order_or_names() -> None:
+    plain, xi = np.asarray(ARM.inertia), np.asarray(ARM.xi)
+    np.testing.assert_array_equal(KNOWN.inertia, plain)
+    np.testing.assert_allclose(KNOWN.xi, xi, rtol=1e-12)
+    for named in (BaseInertia.from_borner(plain), BaseInertia.from_lakatos(xi), BaseInertia(*plain)):
+        np.testing.assert_allclose(KnownArm(ARM.geometry, named).inertia, plain, rtol=1e-12)
+        np.testing.assert_allclose(KNOWN.with_inertia(named).xi, xi, rtol=1e-12)
+
+
 # What is refused.
+
+
+def test_postures_moved_along_one_line_tell_no_inertia(experiment: Experiment) -> None:
+    postures = experiment.postures
+    assert postures is not None
+    alike = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), postures)
+    with pytest.raises(ValueError, match=r"directions of 100 trials are all the same and do not span the plane"):
+        static_inertia(alike, ARM.geometry)
 
 
 def test_jerk_isolation_without_unperturbed_trials_needs_its_cutoff(experiment: Experiment) -> None:

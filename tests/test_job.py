@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jaximp.jobs.job import parse_job, read_job
-from jaximp.models import HumanJoint, Joints, RobotJoint
+from jaximp.models import HumanJoint, Joints, PlanarArm, RobotJoint
 
 GOOD = """
 [recording]
@@ -82,3 +82,44 @@ def test_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("= 3")
     with pytest.raises(ValueError, match="not a TOML file"):
         read_job(tmp_path / "bad.toml")
+
+
+ARM = GOOD.replace("human = true", "[model.arm]\n")
+
+
+def arm_of(keys: str) -> PlanarArm:
+    model, none = parse_job(ARM.replace("[model.arm]\n", f"[model.arm]\n{keys}\n")).models(("revolute", "revolute"))
+    assert isinstance(model, PlanarArm)
+    assert none is None
+    return model
+
+
+def test_an_arm_has_one_table_of_keys() -> None:
+    """The same as beside [trials], for which see test_movement_trials.py; each kind of job says which are not its."""
+    assert arm_of("") == PlanarArm(impedance=False)
+    assert arm_of("equilibrium = [0.1, 1.0]\ninertia = false") == PlanarArm((0.1, 1.0), inertia=False)
+    tied = PlanarArm(impedance=False, gravity=True, length=0.3)
+    for lengths in ("lengths = [0.3, 0.25]", "lengths = [0.3]", "length = 0.3"):
+        assert arm_of(f"gravity = true\n{lengths}") == tied
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("lengths = [0.3, 0.25]", "model.arm.lengths tie inertia to gravity"),
+        ("gravity = true\nlengths = [-0.3]", "length is -0.3: it must be metres, above zero"),
+        ("gravity = true\nlengths = []", "lengths is []: give that of the upper arm"),
+        ("shoulder = [0.0, 0.0]", "model.arm.shoulder is for [trials] of the hand: leave it out"),
+        ("elbow = 'left'", "model.arm.elbow is for [trials] of the hand: leave it out"),
+        (
+            "inertia = { upper_arm = 0.2, forearm = 0.07, coupling = 0.08 }",
+            "model.arm.inertia is known beside [trials]",
+        ),
+        ("inertia = [0.2, 0.07, 0.08]", "numbers alone do not say which is which"),
+        ("inertia = 1", "model.arm.inertia is 1: it must be true or false or a table"),
+        ("gravty = true", "[model.arm] has an unknown key 'gravty': did you mean 'gravity'"),
+    ],
+)
+def test_what_is_wrong_with_an_arm_is_named(keys: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        arm_of(keys)

@@ -512,7 +512,7 @@ def test_a_log_normal_prior_keeps_a_parameter_positive() -> None:
     assert mode[2] > 0
     assert np.isfinite(covariance).all()
     np.testing.assert_allclose(jax.grad(density)(mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
-    assert float(arm_density(K11=Normal(10.0, 0.1)).laplace()[0][4] ** 2) < 20
+    assert float(arm_density(stiffness_11=Normal(10.0, 0.1)).laplace()[0][4] ** 2) < 20
 
 
 def test_prior_predictive_compares_sizes_and_names_what_is_flat() -> None:
@@ -542,7 +542,7 @@ def test_flat_directions_are_named() -> None:
         linear_density(NAMES, UNITS, whiten(record()[0] * [1, 0, 1], y))
     displacement, velocity, torque = pulses()
     displacement[:, 1] = velocity[:, 1] = 0
-    with pytest.raises(ValueError, match="K22 has no effect"):
+    with pytest.raises(ValueError, match="stiffness_22 has no effect"):
         stiffness_density(residual_triangle(displacement, velocity, torque), 300)
 
 

@@ -15,15 +15,11 @@ import pytest
 from scipy.signal import savgol_filter
 
 from jaximp.jobs.job import Job, parse_job
-from jaximp.models import ArmGeometry
-from jaximp.perturbation.movement_trials import (
-    VOLUNTARY_DELAY,
-    find_onset,
-    judge_sensors,
-    read_movements,
-    read_postures,
-)
-from jaximp.perturbation.movements import Handle, Movements
+from jaximp.models.kinematics import ArmGeometry
+from jaximp.perturbation.onsets import find_onset
+from jaximp.perturbation.reading import read_trials
+from jaximp.perturbation.sensors import judge_sensors
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
 from jaximp.recordings.load import (
     load_recording,
     load_trial_table,
@@ -109,7 +105,7 @@ def test_filters_that_cannot_be_are_refused() -> None:
 # --- round trips ------------------------------------------------------------------------------------------------------
 
 
-def shares_of_error(read: Movements, truth: Movements, which: np.ndarray, every: int) -> dict[str, float]:
+def shares_of_error(read: Trials, truth: Trials, which: np.ndarray, every: int) -> dict[str, float]:
     """Root mean square error after the onset, as a share of what the perturbations make."""
     first, samples = int(read.onset[0]), round(VOLUNTARY_DELAY * read.sample_rate)
     free = np.flatnonzero(np.abs(truth.command).max(axis=(1, 2)) == 0)
@@ -128,7 +124,7 @@ def shares_of_error(read: Movements, truth: Movements, which: np.ndarray, every:
 def test_movements_are_those_of_the_simulation(simulated: Reaches, pushed: np.ndarray, every: int) -> None:
     """The bounds are a little above what was measured; the filter takes that much off the perturbation's spectrum."""
     truth = simulated.movements
-    perturbed, unperturbed, notes = read_movements(as_recordings(truth, Sensors(), every=every))
+    perturbed, unperturbed, notes = read_trials(as_recordings(truth, Sensors(), every=every))
     assert (len(perturbed), len(unperturbed or [])) == (6, 4)
     assert perturbed.sample_rate == 4000 / every
     error = shares_of_error(perturbed, truth, pushed, every)
@@ -144,7 +140,7 @@ def test_movements_are_those_of_the_simulation(simulated: Reaches, pushed: np.nd
 
 def test_as_measured_nothing_is_filtered(simulated: Reaches, pushed: np.ndarray) -> None:
     truth = simulated.movements
-    perturbed, unperturbed, _ = read_movements(as_recordings(truth, EXACT, every=1), smooth=False)
+    perturbed, unperturbed, _ = read_trials(as_recordings(truth, EXACT, every=1), smooth=False)
     assert unperturbed is not None
     first, n = int(perturbed.onset[0]), perturbed.position.shape[1]
     for row, k in enumerate(pushed):
@@ -160,7 +156,7 @@ def test_as_measured_nothing_is_filtered(simulated: Reaches, pushed: np.ndarray)
 
 def test_filtered_alike_the_handle_still_is_one(recorded: list[Recording]) -> None:
     """Smoothing acts on force and motion: what links them stays, but for what the differentiator lacks."""
-    perturbed, _, _ = read_movements(recorded)
+    perturbed, _, _ = read_trials(recorded)
     force = HANDLE.force(savitzky_golay(np.moveaxis(np.asarray(perturbed.command), 1, 0), 2000.0).swapaxes(0, 1),
                            perturbed.velocity, perturbed.acceleration)  # fmt: skip
     inside = slice(60, -60)
@@ -214,7 +210,9 @@ def test_trial_table_names_its_trial(tmp_path: Path) -> None:
 def test_postures_are_read() -> None:
     noise = np.zeros((3, 6000, 6))
     truth = jax.jit(lambda: hold_posture(NeuromuscularArm(), POSTURES[:3], ANGLES[[0, 5, 9]], noise, onset=0.5))()
-    postures, _ = read_postures(as_recordings(truth, EXACT, static=True), geometry=ArmGeometry((0.29, 0.34)))
+    recordings = as_recordings(truth, EXACT, static=True)
+    postures, none, _ = read_trials(recordings, "posture", geometry=ArmGeometry((0.29, 0.34)))
+    assert none is None
     first, n = int(postures.onset[0]), postures.position.shape[1]
     start = 2000 - 2 * first
     for name, bound in (("position", 1e-3), ("velocity", 1e-3), ("acceleration", 0.02)):
@@ -223,13 +221,25 @@ def test_postures_are_read() -> None:
         assert (np.asarray(getattr(postures, name)) - values).std() < bound * made, name
 
 
+def test_without_a_filter_nothing_is_filtered_and_no_end_is_lost() -> None:
+    noise = np.zeros((3, 6000, 6))
+    truth = jax.jit(lambda: hold_posture(NeuromuscularArm(), POSTURES[:3], ANGLES[[0, 5, 9]], noise, onset=0.5))()
+    recordings = as_recordings(truth, EXACT, static=True)
+    postures, _, _ = read_trials(recordings, "posture", cutoff=None)
+    assert postures.position.shape == (3, len(recordings[0]), 2)
+    np.testing.assert_array_equal(postures.position, [recording.position for recording in recordings])
+    np.testing.assert_array_equal(postures.force, [recording.torque for recording in recordings])
+    assert np.isnan(postures.velocity).all()
+    assert np.isnan(postures.acceleration).all()
+
+
 def test_measured_derivatives_serve(simulated: Reaches) -> None:
     truth = simulated.movements
     read = [
         replace(r, velocity=np.asarray(truth.velocity[k, ::2]), acceleration=np.asarray(truth.acceleration[k, ::2]))
         for k, r in enumerate(as_recordings(truth, EXACT))
     ]
-    perturbed, _, notes = read_movements(read, smooth=False)
+    perturbed, _, notes = read_trials(read, smooth=False)
     assert (
         shares_of_error(perturbed, truth, np.flatnonzero(np.abs(truth.command).max(axis=(1, 2)) > 0), 2)["acceleration"]
         < 1e-12
@@ -243,13 +253,13 @@ def test_measured_derivatives_serve(simulated: Reaches) -> None:
 def test_onsets_may_be_given(simulated: Reaches, recorded: list[Recording], pushed: np.ndarray) -> None:
     onset = np.full(10, np.nan)
     onset[pushed] = [float(x) // 2 / 2000 for x in np.asarray(simulated.movements.onset)[pushed]]
-    found, _, _ = read_movements(recorded)
-    given, _, _ = read_movements(recorded, onset=onset.tolist())
+    found, _, _ = read_trials(recorded)
+    given, _, _ = read_trials(recorded, onset=onset.tolist())
     np.testing.assert_array_equal(given.position, found.position)
     silent = [replace(r, command=None) for r in recorded]
-    by_handle, _, _ = read_movements(silent, onset=onset.tolist(), handle=HANDLE)
+    by_handle, _, _ = read_trials(silent, onset=onset.tolist(), handle=HANDLE)
     assert np.abs(by_handle.command - found.command).max() < 10  # of 40 N: the filter's transients at the onset
-    unknown, free, notes = read_movements(silent, onset=onset.tolist())
+    unknown, free, notes = read_trials(silent, onset=onset.tolist())
     assert np.isnan(unknown.command).any(axis=(1, 2)).all()
     assert free is not None
     assert any("commands are not known" in note for note in notes)
@@ -257,19 +267,37 @@ def test_onsets_may_be_given(simulated: Reaches, recorded: list[Recording], push
 
 @pytest.mark.parametrize("trigger", [None, (1, 0.4)])
 def test_unperturbed_trials_are_aligned_by_place(recorded: list[Recording], trigger: tuple[int, float] | None) -> None:
-    _, unperturbed, _ = read_movements(recorded, trigger=trigger)
+    _, unperturbed, _ = read_trials(recorded, trigger=trigger)
     assert unperturbed is not None
     place = np.asarray(unperturbed.position)[:, int(unperturbed.onset[0]), 1]
     np.testing.assert_allclose(place, 0.4, atol=4e-4)
 
 
+def test_onset_is_found_in_a_motion_too() -> None:
+    """From its first sample that differs on, and never in the beginning that stands for what is steady."""
+    t = np.arange(1000) / 1000
+    for begin in (0.06, 0.3, 0.99):
+        motion = np.stack([np.clip(t - begin, 0, None) ** 2, 0 * t], axis=1)
+        assert find_onset(motion) == round(1000 * begin)
+        late = find_onset(motion + 1e-5 * np.random.default_rng(0).normal(size=motion.shape))
+        assert (late is None) == (begin == 0.99)
+        assert late is None or 0 <= late - 1000 * begin < 20
+    assert find_onset(np.zeros((1000, 2))) is None
+    spike = np.zeros((1000, 2))
+    spike[500:502] = 1.0
+    assert find_onset(spike) is None
+    assert find_onset(1e-3 * motion, least=1.0) is None
+
+
 def test_noise_of_a_logged_command_is_no_perturbation(recorded: list[Recording], pushed: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     noisy = [replace(r, command=r.command + 0.05 * rng.normal(size=r.command.shape)) for r in recorded]  # type: ignore
-    perturbed, unperturbed, _ = read_movements(noisy)
+    perturbed, unperturbed, _ = read_trials(noisy)
     assert (len(perturbed), len(unperturbed or [])) == (6, 4)
-    late = find_onset("x", noisy[pushed[0]]) - find_onset("x", recorded[pushed[0]])
-    assert 0 <= late < 10
+    found, exact = (find_onset(np.asarray(some[pushed[0]].command)) for some in (noisy, recorded))
+    assert found is not None
+    assert exact is not None
+    assert 0 <= found - exact < 10
 
 
 # --- what is refused, and what is said --------------------------------------------------------------------------------
@@ -313,6 +341,7 @@ def arranged(recorded: list[Recording], pushed: np.ndarray) -> list[Recording]:
 
 
 BAD: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, Any], str]] = {
+    "task": (lambda r: r, {"task": "postur"}, "task is 'postur': did you mean 'posture'"),
     "no trials": (lambda r: [], {}, "there are no trials"),
     "no hand": (at(1, lambda r: replace(r, joints=("revolute",) * 2)), {}, "trial 2 is not a recording of a hand"),
     "sample rate": (at(1, lambda r: cut(r, slice(None, None, 2))), {}, "trial 2 was sampled at 1000 Hz"),
@@ -346,13 +375,13 @@ BAD: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, Any
 def test_bad_trials_are_named(arranged: list[Recording], case: str) -> None:
     spoil, options, message = BAD[case]
     with pytest.raises(ValueError, match=message) as caught:
-        read_movements(spoil(arranged), geometry=ArmGeometry((0.29, 0.34)), **options)
+        read_trials(spoil(arranged), geometry=ArmGeometry((0.29, 0.34)), **options)
     assert "\n" not in str(caught.value)
 
 
 def test_a_gap_elsewhere_shortens_all_trials(arranged: list[Recording]) -> None:
-    whole, _, _ = read_movements(arranged)
-    shorter, _, _ = read_movements(at(1, lambda r: with_gap(r, slice(2400, 2404)))(arranged))
+    whole, _, _ = read_trials(arranged)
+    shorter, _, _ = read_trials(at(1, lambda r: with_gap(r, slice(2400, 2404)))(arranged))
     n = shorter.position.shape[1]
     assert n < whole.position.shape[1]
     first = int(whole.onset[0])
@@ -365,12 +394,12 @@ def test_gaps_at_the_beginning_do_not_matter(arranged: list[Recording]) -> None:
         begun = np.arange(len(r))[:, None] >= 200
         return replace(with_gap(r, slice(200)), command=np.where(begun, r.command, np.nan))
 
-    perturbed, unperturbed, _ = read_movements(at(1, lose)(arranged))
+    perturbed, unperturbed, _ = read_trials(at(1, lose)(arranged))
     assert (len(perturbed), len(unperturbed or [])) == (6, 4)
 
 
 def test_what_is_missing_is_said(arranged: list[Recording]) -> None:
-    perturbed, unperturbed, notes = read_movements(arranged[:6], window=0.2)
+    perturbed, unperturbed, notes = read_trials(arranged[:6], window=0.2)
     assert unperturbed is None
     assert len(perturbed) == 6
     assert any("the window of 200 ms is longer than the voluntary delay of 115 ms" in note for note in notes)
@@ -385,11 +414,11 @@ def test_sensors_are_judged(simulated: Reaches, pushed: np.ndarray, noise: float
         replace(r, position=r.position + noise * rng.normal(size=r.position.shape))
         for r in as_recordings(simulated.movements, EXACT)
     ]
-    perturbed, unperturbed, notes = read_movements(read, smooth=False)
+    perturbed, unperturbed, notes = read_trials(read, smooth=False)
     assert says in notes[0]
     found = judge_sensors(perturbed, unperturbed)
     assert found.level == pytest.approx(noise, rel=0.05)
-    exact, free, _ = read_movements(as_recordings(simulated.movements, EXACT), smooth=False)
+    exact, free, _ = read_trials(as_recordings(simulated.movements, EXACT), smooth=False)
     assert free is not None
     inside = slice(int(exact.onset[0]), int(exact.onset[0]) + 230)
 
@@ -402,7 +431,7 @@ def test_sensors_are_judged(simulated: Reaches, pushed: np.ndarray, noise: float
 
 
 def test_coarse_encoders_are_seen(simulated: Reaches) -> None:
-    notes = read_movements(as_recordings(simulated.movements, Sensors(1e-4, 0.5)))[2]
+    notes = read_trials(as_recordings(simulated.movements, Sensors(1e-4, 0.5)))[2]
     assert "an encoder in steps of 100 um" in notes[0]
     assert "will not work; use output error" in notes[0]
     assert re.search(r"noise of 0.(5|49) N is \d+ % of what they change it by: perturb harder", notes[1])
@@ -427,8 +456,8 @@ def test_a_job_of_trials_has_defaults() -> None:
     assert job.trials is not None
     assert (job.trials.task, job.trials.window, job.window.length) == ("movement", 0.115, 0.115)
     assert job.trials.handle is None
-    assert job.model.hand_arm is not None
-    assert job.model.hand_arm.geometry().lengths == (0.29, 0.34)
+    assert job.model.arm is not None
+    assert job.model.arm.geometry().lengths == (0.29, 0.34)
     with pytest.raises(ValueError, match=r"this job has .trials. and no .recording."):
         job.load()
 
@@ -437,8 +466,9 @@ def test_a_job_of_trials_has_settings() -> None:
     text = JOB.replace("[model.arm]", "trigger = { axis = 2, position = 0.4 }\ncutoff = [2, 30]\nonset = [0.5, nan]\n"
                        "method = 'gomi_kawato'\n[trials.handle]\nmass = [4, 6]\ndamping = [20, 20]\n"
                        "[model.arm]\nshoulder = [0.1, -0.2]\n"
-                       "inertia = [0.2, 0.07, 0.08]\ninertia_stderr = [0.01, 0.01, 0.01]")  # fmt: skip
-    trials, arm = parse_job(text).trials, parse_job(text).model.hand_arm
+                       "inertia = { upper_arm = 0.2, forearm = 0.07, coupling = 0.08 }\n"
+                       "inertia_stderr = { upper_arm = 0.01, forearm = 0.02, coupling = 0.03 }")  # fmt: skip
+    trials, arm = parse_job(text).trials, parse_job(text).model.arm
     assert trials is not None
     assert arm is not None
     assert trials.handle is not None
@@ -446,7 +476,10 @@ def test_a_job_of_trials_has_settings() -> None:
     assert trials.trigger is not None
     assert (trials.trigger.axis, trials.trigger.position) == (2, 0.4)
     assert arm.geometry().shoulder == (0.1, -0.2)
-    assert arm.inertia == [0.2, 0.07, 0.08]
+    assert arm.known_inertia is not None
+    assert arm.known_stderr is not None
+    np.testing.assert_allclose(arm.known_inertia.borner, [0.2, 0.07, 0.08])
+    np.testing.assert_allclose(arm.known_stderr.borner, [0.01, 0.02, 0.03])
 
 
 @pytest.mark.parametrize(
@@ -487,11 +520,36 @@ def test_a_job_of_trials_has_settings() -> None:
         ("[trials]", "[trials]\nhandle = 3", "trials.handle is 3: it must be a table"),
         ("[trials]", "[trials]\ntrigger = { axis = 3, position = 0 }", "trials.trigger.axis is 3: it must be 1 or 2"),
         ("[trials]", "[trials]\ntrigger = { axis = 2 }", "[trials.trigger] has no 'position'"),
-        ("lengths = [0.29, 0.34]", "length = 0.29", "[model.arm] has an unknown key 'length': did you mean 'lengths'"),
+        ("lengths = [0.29, 0.34]", "length = 0.29", "lengths is [0.29]: it must be two finite numbers"),
+        ("lengths = [0.29, 0.34]", "lenths = [0.29, 0.34]", "unknown key 'lenths': did you mean 'lengths'"),
         ("lengths = [0.29, 0.34]", "lengths = [0.29, -1]", "lengths is"),
         ("lengths = [0.29, 0.34]", "", "[model.arm] has no 'lengths'"),
-        ("[model.arm]", "[model.arm]\ninertia = [1, 2]", "model.arm.inertia is [1.0, 2.0]: it must be three numbers"),
-        ("[model.arm]", "[model.arm]\ninertia_stderr = [1, 2, 3]", "needs model.arm.inertia"),
+        ("[model.arm]", "[model.arm]\ninertia = [1, 2]", "numbers alone do not say which is which: write inertia = {"),
+        (
+            "[model.arm]",
+            "[model.arm]\ninertia = [0.19, 0.07, 0.08]",
+            "write inertia = { upper_arm = 0.19, forearm = 0.07, coupling = 0.08 }, if they are I_1 + m_2 l1^2, I_2, "
+            "m_2 c_2 l1 in kg m^2",
+        ),
+        ("[model.arm]", "[model.arm]\ninertia_stderr = [1, 2, 3]", "write inertia_stderr = { upper_arm = 1,"),
+        (
+            "[model.arm]",
+            "[model.arm]\ninertia_stderr = { upper_arm = 1, forearm = 1, coupling = 1 }",
+            "needs model.arm.inertia",
+        ),
+        (
+            "[model.arm]",
+            "[model.arm]\ninertia = { upper_arm = 1, forearm = 1, coupling = 0 }",
+            "'coupling': 0.0}: all must be numbers above zero",
+        ),
+        (
+            "[model.arm]",
+            "[model.arm]\ninertia = { upper_arm = 1, forearm = 1 }",
+            "[model.arm.inertia] has no 'coupling': add it",
+        ),
+        ("[model.arm]", "[model.arm]\ninertia = true", "here write what it is, inertia = { upper_arm"),
+        ("[model.arm]", "[model.arm]\ngravity = true", "model.arm.gravity is for a [recording] of the joints"),
+        ("[model.arm]", "[model.arm]\nlength = 0.3", "model.arm.length and model.arm.lengths both stand there"),
         ("[model.arm]\nlengths = [0.29, 0.34]", "[model]\nhuman = true", "add [model.arm] with its lengths"),
         ("[model.arm]", "[model]\nhuman = true\n[model.arm]", "unknown key 'human'"),
         ("[trials]", "[window]\nlength = 1\n[trials]", "leave out 'window'"),

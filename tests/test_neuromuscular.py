@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 
 from jaximp.models import mass_matrix
 from jaximp.papers.arm_experiments import subject
-from jaximp.perturbation.movements import Handle
+from jaximp.perturbation.trials import Handle
 from jaximp.simulation.neuromuscular import (
     RATE,
     Drive,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from jaximp.models import ArmGeometry
-from jaximp.perturbation import output_error as module
-from jaximp.perturbation.movements import Movements
-from jaximp.perturbation.output_error import OutputErrorFit, output_error
+from jaximp.perturbation.isolation import output_error as module
+from jaximp.perturbation.isolation.output_error import OutputErrorFit, output_error
+from jaximp.perturbation.trials import Trials
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach, neural_noise, perturbing_forces, reach
 
 ARM = NeuromuscularArm()
@@ -21,17 +21,17 @@ GEOMETRY = ArmGeometry((0.29, 0.34))
 PERTURBED, OTHERS = 20, 40
 
 
-class Trials(eqx.Module):
+class Simulated(eqx.Module):
     """20 perturbed trials, the same without the perturbation, 40 others, and the true stiffness (20, 3)."""
 
-    perturbed: Movements
-    twins: Movements
-    unperturbed: Movements
+    perturbed: Trials
+    twins: Trials
+    unperturbed: Trials
     K: Any
 
 
 @pytest.fixture(scope="module")
-def trials() -> Trials:
+def trials() -> Simulated:
     task, keys = Reach(duration=1.0), jax.random.split(jax.random.key(5), 3)
     noise = jnp.concatenate([neural_noise(k, n, 3400) for k, n in zip(keys, (PERTURBED, OTHERS), strict=False)])
     forces = jnp.concatenate([perturbing_forces(keys[2], 1), jnp.zeros((PERTURBED + OTHERS, 2))])
@@ -41,38 +41,38 @@ def trials() -> Trials:
         k[first : first + 461].mean(axis=0)
         for k, first in zip(parts[1].stiffness, parts[1].movements.onset, strict=True)
     ]
-    return Trials(*(part.movements for part in parts), np.array(K))
+    return Simulated(*(part.movements for part in parts), np.array(K))
 
 
-def fit_of(trials: Trials, **options: Any) -> OutputErrorFit:
+def fit_of(trials: Simulated, **options: Any) -> OutputErrorFit:
     return output_error(trials.perturbed, trials.unperturbed, GEOMETRY, ARM.handle, ARM.inertia, **options)
 
 
 @pytest.fixture(scope="module")
-def fit(trials: Trials) -> OutputErrorFit:
+def fit(trials: Simulated) -> OutputErrorFit:
     return fit_of(trials, groups=np.arange(20).reshape(2, 10))
 
 
-def lanes_of(perturbed: Movements) -> Any:
+def lanes_of(perturbed: Trials) -> Any:
     return module._in_lanes(perturbed, GEOMETRY, ARM.handle, module._Bins.of(RATE, 0.115))
 
 
 THETA = np.array([2.4, 1.2, 1.1, 1.4, 29.0, 14.0, 17.0, *np.linspace(-0.3, 0.3, 7), 0.19, 0.074, 0.084, 3.3e-4])
 
 
-def test_the_derivative_of_the_deviation_is_its_difference(trials: Trials) -> None:
+def test_the_derivative_of_the_deviation_is_its_difference(trials: Simulated) -> None:
     lanes = lanes_of(trials.perturbed)
     of = eqx.filter_jit(module._deviation_in_bins)
     _, S = module._linearised(jnp.asarray(THETA), lanes, GEOMETRY, ARM.handle)
     for k in range(18):
-        h = 1e-5 if k < module.DELAY else 1e-7
+        h = 1e-5 if k < module.PLACES.delay else 1e-7
         ahead, behind = (of(jnp.asarray(THETA + step * np.eye(18)[k]), lanes, GEOMETRY, ARM.handle) for step in (h, -h))
         np.testing.assert_allclose(
             S[..., k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-6 * np.abs(S[..., k]).max()
         )
 
 
-def without_noise(theta: np.ndarray, trials: Trials) -> Movements:
+def without_noise(theta: np.ndarray, trials: Simulated) -> Trials:
     """Trials of which the deviation is exactly that of an arm with the parameters theta, found by iteration."""
     found, twins = trials.perturbed, trials.twins
     rows = np.arange(PERTURBED)[:, None], np.asarray(twins.onset)[:, None] + np.arange(461)
@@ -86,9 +86,9 @@ def without_noise(theta: np.ndarray, trials: Trials) -> Movements:
     return found
 
 
-def test_an_impedance_without_noise_is_given_back(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impedance_without_noise_is_given_back(trials: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
     theta = THETA.copy()
-    theta[module.DELAY], theta[module.INERTIA] = 0.0, ARM.inertia
+    theta[module.PLACES.delay], theta[module.PLACES.inertia] = 0.0, ARM.inertia
     perturbed = without_noise(theta, trials)
     measured = module._flat(module._binned(trials.twins, 0, 23, module._Bins.of(RATE, 0.115)))
     # The movement that would have been is known, so that nothing but the fit is left to err.
@@ -98,11 +98,11 @@ def test_an_impedance_without_noise_is_given_back(trials: Trials, monkeypatch: p
     fit = output_error(perturbed, trials.unperturbed, GEOMETRY, ARM.handle, ARM.inertia)
     np.testing.assert_allclose(fit.D.ravel(), theta[:4], rtol=1e-6)
     np.testing.assert_allclose(fit.K.ravel(), theta[[4, 5, 5, 6]], rtol=1e-6)
-    np.testing.assert_allclose(fit.kappa, theta[module.KAPPA], atol=1e-5)
+    np.testing.assert_allclose(fit.kappa, theta[module.PLACES.kappa], atol=1e-5)
     assert abs(fit.delay) < 1e-8
 
 
-def test_the_deviation_is_that_of_the_twins(trials: Trials, fit: OutputErrorFit) -> None:
+def test_the_deviation_is_that_of_the_twins(trials: Simulated, fit: OutputErrorFit) -> None:
     """To what the trials' own impedance differs from their mean: within 1 % in position, and zero at the onset."""
     rows = np.arange(PERTURBED)[:, None], np.asarray(trials.twins.onset)[:, None] + np.arange(461)
     for signal, share in (("position", 0.01), ("velocity", 0.01), ("acceleration", 0.01), ("force", 0.02)):
@@ -113,7 +113,7 @@ def test_the_deviation_is_that_of_the_twins(trials: Trials, fit: OutputErrorFit)
     assert np.abs(fit.deviations.position[:, 0]).max() < 1e-12
 
 
-def test_the_impedance_is_found(trials: Trials, fit: OutputErrorFit) -> None:
+def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
     """In a movement of 1 s, where feedback jerk isolation errs by 15 %, from 10 trials a group."""
     assert fit.K.shape == fit.D.shape == (2, 2, 2)
     assert fit.covariance.shape == (2, 18, 18)
@@ -129,7 +129,7 @@ def test_the_impedance_is_found(trials: Trials, fit: OutputErrorFit) -> None:
         assert (of_D < 0.15 * K.max() / 12).all()
 
 
-def test_one_group_has_no_leading_axis(trials: Trials, fit: OutputErrorFit) -> None:
+def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -> None:
     alone = fit_of(trials)
     assert alone.K.shape == (2, 2)
     assert alone.stderr.shape == (18,)
@@ -139,18 +139,18 @@ def test_one_group_has_no_leading_axis(trials: Trials, fit: OutputErrorFit) -> N
 
 
 @pytest.mark.parametrize("late", [-3, 2, 32])
-def test_motion_that_lags_its_command_is_found(trials: Trials, late: int) -> None:
+def test_motion_that_lags_its_command_is_found(trials: Simulated, late: int) -> None:
     early = eqx.tree_at(lambda m: m.command, trials.perturbed, np.roll(trials.perturbed.command, -late, axis=1))
     fit = fit_of(eqx.tree_at(lambda t: t.perturbed, trials, early))
     assert abs(fit.delay - late / RATE) < 2e-5
     np.testing.assert_allclose(fit.K, fit_of(trials).K, rtol=2e-3)
 
 
-def test_a_slower_recording_is_integrated_in_the_same_steps(trials: Trials) -> None:
+def test_a_slower_recording_is_integrated_in_the_same_steps(trials: Simulated) -> None:
     fast = eqx.tree_at(lambda m: m.onset, trials.perturbed, trials.perturbed.onset // 4 * 4)
     m, every = fast, slice(None, None, 4)
     signals = (jnp.asarray(x[:, every]) for x in (m.position, m.velocity, m.acceleration, m.force, m.command))
-    slow = Movements(*signals, jnp.asarray(m.onset // 4), RATE / 4)
+    slow = Trials(*signals, jnp.asarray(m.onset // 4), RATE / 4)
     found = module._in_lanes(slow, GEOMETRY, ARM.handle, module._Bins.of(RATE / 4, 0.115))
     expected = lanes_of(fast)
     assert (found.rate, found.finer, found.width) == (RATE, 4, 5)
@@ -159,7 +159,7 @@ def test_a_slower_recording_is_integrated_in_the_same_steps(trials: Trials) -> N
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=2e-3 * size, err_msg=name)
 
 
-def test_a_command_in_another_frame_is_noticed(trials: Trials) -> None:
+def test_a_command_in_another_frame_is_noticed(trials: Simulated) -> None:
     """Turned by 0.1 rad: no impedance explains the motion."""
     turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
     fit = fit_of(eqx.tree_at(lambda t: t.perturbed.command, trials, trials.perturbed.command @ turn))
@@ -167,7 +167,7 @@ def test_a_command_in_another_frame_is_noticed(trials: Trials) -> None:
     assert not fit.ok
 
 
-def broken(trials: Trials, where: str) -> Trials:
+def broken(trials: Simulated, where: str) -> Simulated:
     """Trials of which one thing is wrong."""
     nothing = np.where(np.arange(PERTURBED) == 3, np.nan, 0)[:, None, None]
     at = {
@@ -182,8 +182,8 @@ def broken(trials: Trials, where: str) -> Trials:
     return eqx.tree_at(at[where][0], trials, at[where][1])
 
 
-def slower(m: Movements) -> Movements:
-    return Movements(m.position, m.velocity, m.acceleration, m.force, m.command, m.onset, 2000.0)
+def slower(m: Trials) -> Trials:
+    return Trials(m.position, m.velocity, m.acceleration, m.force, m.command, m.onset, 2000.0)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -199,7 +199,7 @@ def slower(m: Movements) -> Movements:
         ("rate", "bring them to one rate"),
     ],
 )
-def test_trials_that_cannot_be_used_are_refused(trials: Trials, where: str, message: str) -> None:
+def test_trials_that_cannot_be_used_are_refused(trials: Simulated, where: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fit_of(broken(trials, where))
 
@@ -214,6 +214,6 @@ def test_trials_that_cannot_be_used_are_refused(trials: Trials, where: str, mess
         ({"inertia_stderr": np.zeros(3)}, "inertia_stderr is .* three finite numbers above zero"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(trials: Trials, options: dict[str, Any], message: str) -> None:
+def test_options_that_make_no_sense_are_refused(trials: Simulated, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fit_of(trials, **options)

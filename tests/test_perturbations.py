@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaximp.design.excitation import Limits
 from jaximp.design.perturbations import condition_of, design_perturbations
-from jaximp.models import PlanarArm
+from jaximp.models import BaseInertia, PlanarArm
 from jaximp.papers.lakatos2011 import noise_free_conditions
 from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, imposed_motion
 
@@ -82,6 +84,20 @@ def test_a_design_without_time_is_refused() -> None:
 def test_perturbations_have_limits(limits: Limits, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_order_of_the_inertia_is_lakatos_or_named() -> None:
+    named = BaseInertia.from_lakatos(INERTIA)
+    limits = Limits(position=(-0.05, 0.05), torque=0.5)
+    options: dict[str, Any] = {"way_points": 2, "starts": 1}
+    plain, by_name = (design_perturbations(ARM, POSTURE, 0.3, one, limits, **options) for one in (INERTIA, named))
+    np.testing.assert_allclose(by_name.points, plain.points, rtol=1e-9)
+    # A forearm so heavy has no such coupling: here physics can tell that the order is another.
+    heavy = BaseInertia(upper_arm=0.1, forearm=0.09, coupling=0.01)
+    np.testing.assert_allclose(BaseInertia.from_lakatos(heavy.lakatos).check().borner, heavy.borner)
+    with pytest.raises(ValueError, match="no rigid body has the inertia"):
+        design_perturbations(ARM, POSTURE, 0.3, np.asarray(heavy.borner), limits, **options)
 
 
 def test_every_joint_and_direction_has_its_own_limit() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from jaximp.papers import borner2020, lakatos2011, tout2023
 from jaximp.papers.arm_experiments import Case, as_matrix, replayed_torque, run_case
-from jaximp.perturbation.isolation import in_window
+from jaximp.perturbation.trials import in_window
 from jaximp.simulation.neuromuscular import NeuromuscularArm
 
 

@@ -14,14 +14,15 @@ import pytest
 from jaximp import load_recording, recording_from_arrays, save_recording
 from jaximp.identification import FilterSettings
 from jaximp.least_squares.window import WindowFit
-from jaximp.models import ArmGeometry, PlanarArm
-from jaximp.perturbation.trials import (
-    Trials,
+from jaximp.models.arm import PlanarArm
+from jaximp.models.kinematics import ArmGeometry
+from jaximp.perturbation.reading import read_trials
+from jaximp.perturbation.regression import (
+    JointTrials,
     fit_trials,
     joint_trials,
     load_trials,
     predict_trials,
-    read_trials,
     regress_trials,
 )
 from jaximp.simulation.held_arm import DIRECTIONS, LATENCIES, HeldArm, HeldTrials, hold
@@ -146,13 +147,19 @@ def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Record
         columns[channel] = [f"{channel}{j}_{unit}" for j in (1, 2)]
     rows = load_trials(files, QUIET.geometry, ARM, FILTER, before=0.15, after=0.4, **columns)
     read = [load_recording(file, joint="prismatic", **columns) for file in files]
-    trials = read_trials(read, QUIET.geometry, before=0.15, after=0.4)
+    trials = at_joints(read, before=0.15, after=0.4)
     assert trials.onset == 150
     np.testing.assert_array_equal(rows.W, regress_trials(ARM, trials, FILTER).W)
     again = fit_trials(rows, 0.27)
     np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
-    given = read_trials(read, QUIET.geometry, onset=0.15, before=0.15, after=0.4)
+    given = at_joints(read, onset=0.15, before=0.15, after=0.4)
     np.testing.assert_array_equal(given.angles, trials.angles)
+
+
+def at_joints(recordings: list[Recording], **options: Any) -> JointTrials:
+    """As measured."""
+    read, _, _ = read_trials(recordings, "posture", geometry=QUIET.geometry, cutoff=None, **options)
+    return joint_trials(QUIET.geometry, read.position, read.force, int(read.onset[0]), read.sample_rate)
 
 
 def test_unseen_trials_are_predicted(held: HeldTrials) -> None:
@@ -189,7 +196,7 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
             lambda r: [replace(r[0], joints=("revolute", "revolute"))], "not a recording of a hand", id="hand"
         ),
         pytest.param(lambda r: [r[0], resampled(r[1])], "sampled at 500 Hz", id="rate"),
-        pytest.param(lambda r: [gap(r[0])], "gap around its onset", id="gap"),
+        pytest.param(lambda r: [gap(r[0])], "trial 1 .0. has a gap at 0.2 s, and its perturb", id="gap"),
         pytest.param(lambda r: [], "no trials", id="none"),
         pytest.param(lambda r: [r[0], late(r[1], 0.05)], "trial 2 moves before its onset", id="late onset"),
         pytest.param(lambda r: [moved(r[0], 1.0)], "reach", id="out of reach"),
@@ -198,7 +205,7 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
 )
 def test_bad_trials_are_named(logged: list[Recording], spoil: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        read_trials(spoil(logged), QUIET.geometry, before=0.15, after=0.35)
+        at_joints(spoil(logged), before=0.15, after=0.35)
 
 
 def shortened(recording: Recording, n: int) -> Recording:
@@ -367,5 +374,5 @@ def test_confidence_needs_an_arm(fitted: WindowFit) -> None:
 def test_trials_are_a_pytree(held: HeldTrials) -> None:
     trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
     traced = jax.jit(lambda x, f: joint_trials(QUIET.geometry, x, f, 150, RATE))(held.position, held.force)
-    assert isinstance(traced, Trials)
+    assert isinstance(traced, JointTrials)
     np.testing.assert_allclose(traced.torque, trials.torque, atol=1e-12)

@@ -43,8 +43,8 @@ def check(job_file: JobFile) -> None:
 
 def _check_trials(job: Job) -> None:
     """How many trials were read, and what reading says of them."""
-    from jaximp.perturbation.impedance import DISAGREEMENT
-    from jaximp.perturbation.movement_trials import handle_disagreement
+    from jaximp.perturbation.rules import DISAGREEMENT
+    from jaximp.perturbation.sensors import handle_disagreement
 
     for table in job.tables_of_trials():
         perturbed, unperturbed, notes = table.load()

@@ -56,7 +56,7 @@ def identify_into(job: Job, folder: Path) -> None:
 
 
 def _identify_trials_into(job: Job, folder: Path) -> None:
-    from jaximp.perturbation.impedance import identify_trials
+    from jaximp.jobs.run_trials import identify_trials
 
     Thread(target=import_module, args=("jaximp.reports.impedance",)).start()
     with bar_of("identifying") as progress:
@@ -67,7 +67,7 @@ def _identify_trials_into(job: Job, folder: Path) -> None:
         progress(1.0)
     for estimate in result.estimates:
         _say_impedance(estimate)
-    for note in result.main.notes:
+    for note in result.notes:
         typer.echo(f"note: {note}")
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Num, Shaped
 from jaximp.design.excitation import Limits, room
 from jaximp.design.objectives import log_condition
 from jaximp.models.arm import PlanarArm, rigid_body_torque
+from jaximp.models.inertia import BaseInertia
 from jaximp.motion.trajectories import MinimumJerk
 from jaximp.numerics.optimise import Found, minimise
 from jaximp.numerics.precision import require_float64
@@ -71,7 +72,7 @@ def design_perturbations(
     model: PlanarArm,
     posture: Num[AnyArray, "2"],
     observed: float,
-    inertia: Num[AnyArray, "3"],
+    inertia: BaseInertia | Num[AnyArray, "3"],
     limits: Limits,
     *,
     trials: int = 6,
@@ -81,21 +82,22 @@ def design_perturbations(
 ) -> Perturbations:
     """Perturbations that tell all parameters of an arm apart in a short observation.
 
-    **Arguments:** `posture` (2,) at rest [rad]; `observed` [s] from the onset on; `inertia` (3,) base parameters that
-    bound the torque; `limits` of the displacement (`position` [rad], from the posture), velocity, acceleration and
-    inertial torque, one number for both joints or one for each; `trials` in the set; `way_points` of each after the
-    onset.
+    **Arguments:** `posture` (2,) at rest [rad]; `observed` [s] from the onset on; `inertia` that bounds the torque, a
+    `BaseInertia`, or three numbers **in Lakatos's order**, `inertia_1` to `inertia_3` of `PlanarArm` [kg m^2]; `limits`
+    of the displacement (`position` [rad], from the posture), velocity, acceleration and inertial torque, one number for
+    both joints or one for each; `trials` in the set; `way_points` of each after the onset.
 
     **Returns:** the best of `starts` sets, as large as the limits allow.
 
-    **Raises:** `ValueError` for settings that make no sense, displacements without a limit, and a limit of the jerk.
+    **Raises:** `ValueError` for settings that make no sense, an inertia that no rigid body has, displacements without a
+    limit, and a limit of the jerk.
     """
     require_float64()
     if not observed > 0 or min(trials, way_points, starts) < 1:
         raise ValueError("observed must be above zero, and there must be at least one trial, way point and start")
-    posture, inertia = np.asarray(posture, float), np.asarray(inertia, float)
-    if not (np.abs(posture) < 2 * np.pi).all() or not np.isfinite(inertia).all():
-        raise ValueError(f"posture {posture} and inertia {inertia} must be finite, the posture in radians")
+    posture, xi = np.asarray(posture, float), BaseInertia.from_lakatos(inertia).check().lakatos
+    if not (np.abs(posture) < 2 * np.pi).all() or not np.isfinite(xi).all():
+        raise ValueError(f"posture {posture} and inertia {xi} must be finite, the posture in radians")
     low, high, most = room(limits, 2)
     if not (low < 0).all() or not (high > 0).all() or not np.isfinite([low, high]).all():
         raise ValueError("limits.position is the displacement from the posture: give both ends, such as (-0.05, 0.05)")
@@ -107,7 +109,7 @@ def design_perturbations(
     order = np.argsort(np.asarray(found.value))
     points, condition = _scaled(
         model, jnp.asarray(posture, float), jnp.asarray(observed, float), found.x[order[0]].reshape(shape),
-        jnp.asarray(inertia), *(jnp.asarray(x) for x in (low, high, most)),
+        xi, *(jnp.asarray(x) for x in (low, high, most)),
     )  # fmt: skip
     return Perturbations(np.asarray(points), observed, float(condition), np.exp(np.asarray(found.value)[order]))
 
@@ -128,7 +130,7 @@ def _scaled(
     posture: Array,
     observed: Array,
     points: Array,
-    inertia: Array,
+    xi: Array,
     low: Array,
     high: Array,
     most: Array,
@@ -136,7 +138,7 @@ def _scaled(
     """The set of perturbations made as large as its limits allow, and its condition number."""
     points = _from_rest(points)
     fine = _motions(points, observed, FINER * SAMPLES)
-    points = points * _largest_factor(posture, fine, inertia, low, high, most)
+    points = points * _largest_factor(posture, fine, xi, low, high, most)
     return points, condition_of(model, posture, _motions(points, observed))
 
 
@@ -164,7 +166,7 @@ def _gram(W: Array) -> Array:
 
 
 def _largest_factor(
-    posture: Array, motions: tuple[Array, ...], inertia: Array, low: Array, high: Array, most: Array
+    posture: Array, motions: tuple[Array, ...], xi: Array, low: Array, high: Array, most: Array
 ) -> Array:
     """The factor on all displacements that just keeps the limits."""
     away, dq, ddq = motions
@@ -172,6 +174,6 @@ def _largest_factor(
     factor = 1 / jnp.stack([share.max() for share in shares]).max()
     for _ in range(20):  # the torque is nearly linear in the motion
         q, v, a = posture + factor * away, factor * dq, factor * ddq
-        torque = (jnp.abs(rigid_body_torque(q, v, a, inertia)) / most[3]).max()
+        torque = (jnp.abs(rigid_body_torque(q, v, a, xi)) / most[3]).max()
         factor = jnp.where(torque > 1, factor / torque, factor)
     return factor

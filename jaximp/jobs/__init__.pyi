@@ -1,7 +1,7 @@
+from .arm import ArmSettings as ArmSettings
 from .design import DesignJob as DesignJob
 from .design import parse_design_job as parse_design_job
 from .design import read_design_job as read_design_job
-from .job import ArmSettings as ArmSettings
 from .job import HumanSettings as HumanSettings
 from .job import Job as Job
 from .job import ModelSettings as ModelSettings
@@ -16,5 +16,6 @@ from .run import infer as infer
 from .run import infer_recording as infer_recording
 from .run import infer_trials as infer_trials
 from .run import prepare as prepare
-from .trials import HandArmSettings as HandArmSettings
+from .run_trials import TrialsResult as TrialsResult
+from .run_trials import identify_trials as identify_trials
 from .trials import TrialsSettings as TrialsSettings

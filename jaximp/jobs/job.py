@@ -17,9 +17,9 @@ from jaximp.design.files import read_trajectory
 from jaximp.identification.filters import FilterSettings
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import METHODS
+from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
-from jaximp.jobs.trials import HandArmSettings, TrialsSettings, arm_settings, trials_settings
-from jaximp.models.arm import PlanarArm
+from jaximp.jobs.trials import TrialsSettings, trials_settings
 from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, RobotJoint
 from jaximp.models.reflex import ReflexPathway
@@ -103,36 +103,6 @@ class HumanSettings:
 
 
 @dataclass(frozen=True)
-class ArmSettings:
-    """Columns of `models.PlanarArm`: two joints that share their parameters."""
-
-    equilibrium: list[float] | None = None
-    """Two angles [rad]; damping and stiffness about them are identified where it is given."""
-    inertia: bool = True
-    """Columns of the three base inertial parameters."""
-    gravity: bool = False
-    """Columns of gravity: the arm does not move in a horizontal plane."""
-    viscous: bool = False
-    """A column of viscous friction for each joint."""
-    coulomb: bool = False
-    """A column of Coulomb friction for each joint."""
-    offset: bool = False
-    """A column of a constant torque for each joint."""
-    rotor: bool = False
-    """A column of the inertia of the second motor's rotor behind its gear, which counts on its own joint alone."""
-    g: float = 9.81
-    """Acceleration of gravity [m/s^2]."""
-    zero: str = "horizontal"
-    """Where gravity acts: at angles of zero the arm is `horizontal`, or `hanging`."""
-    length: float | None = None
-    """Length of the upper arm [m], if it is known: it ties the inertia to the gravity."""
-
-    def make(self) -> PlanarArm:
-        """The model."""
-        return PlanarArm(**vars(self), impedance=self.equilibrium is not None)
-
-
-@dataclass(frozen=True)
 class ModelSettings:
     """What is identified: a human joint, a robot joint, or the human in the robot by some of the four methods; or an
     arm of two joints."""
@@ -140,8 +110,7 @@ class ModelSettings:
     human: HumanSettings | None = None
     robot: RobotSettings | None = None
     arm: ArmSettings | None = None
-    hand_arm: HandArmSettings | None = None
-    """`[model.arm]` of a job with `[trials]`."""
+    """Whose joints were recorded, or of a job with `[trials]` the one whose hand was."""
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
     beside it."""
@@ -295,9 +264,9 @@ def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
     if not isinstance(model, dict) or "arm" not in model:
         raise ValueError("[trials] are those of an arm: add [model.arm] with its lengths")
     check_keys(model, ["arm"], "[model] beside [trials]")
-    arm = arm_settings(model["arm"])
+    arm = arm_of_trials(model["arm"])
     trials = trials_settings(tables["trials"], folder, arm.geometry())
-    if arm.inertia is not None and trials.posture is not None:
+    if arm.known_inertia is not None and trials.posture is not None:
         raise ValueError("model.arm.inertia and [trials.posture] both give the arm's inertia: keep one of them")
     trust = settings(TrustLimits, tables.get("trust", {}), "trust")
     _check_limits(trust)
@@ -305,8 +274,9 @@ def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
     posterior = posterior_settings(tables.get("posterior", {}))
     if posterior.prior:
         raise ValueError("[posterior.prior] is for jobs with a recording: an arm's impedance has none")
-    model_of_arm = ModelSettings(hand_arm=arm)
-    return Job({}, model_of_arm, window, trust=trust, posterior=posterior, trials=trials, folder=folder, text=text)
+    return Job(
+        {}, ModelSettings(arm=arm), window, trust=trust, posterior=posterior, trials=trials, folder=folder, text=text
+    )
 
 
 def posterior_settings(table: Any) -> PosteriorSettings:
@@ -331,11 +301,10 @@ def model_settings(table: Any) -> ModelSettings:
     check_keys(table, ["human", "robot", "arm", "methods"], "[model]")
     robot = optional(RobotSettings, table.get("robot", False), "model.robot")
     human = optional(HumanSettings, table.get("human", False), "model.human")
-    arm = optional(ArmSettings, table.get("arm", False), "model.arm")
+    arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])
     if arm is not None:
         if robot is not None or human is not None:
             raise ValueError("model.arm stands alone: leave out model.robot and model.human")
-        arm.make()  # refuses what does not go together
         if "methods" in table:
             raise ValueError("model.methods tell a human from a robot on one joint: leave them out beside model.arm")
     methods = table.get("methods", [1])

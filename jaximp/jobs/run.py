@@ -9,7 +9,7 @@ from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import Prepared, estimate
 from jaximp.identification.identify import prepare as prepare_recording
 from jaximp.jobs.job import Job
-from jaximp.perturbation.impedance import ArmImpedance, identify_trials
+from jaximp.jobs.run_trials import TrialsResult, identify_trials
 from jaximp.posterior.densities import estimate_density
 from jaximp.posterior.draws import Posterior, derive
 from jaximp.posterior.inference import Inference, posterior_of
@@ -62,17 +62,19 @@ def infer_recording(
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)
 
 
-def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[ArmImpedance, Posterior]:
-    """An arm's damping and stiffness from a job with `[trials]`: the estimate, and draws of D11 to K22 around it.
+def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[TrialsResult, Posterior]:
+    """An arm's damping and stiffness from a job with `[trials]`: what was identified, and draws around its main
+    estimate.
 
     Student's t with the estimate's covariance and degrees of freedom, within positive definite stiffnesses.
 
     **Raises:** `ValueError` for an estimate without standard errors, and as `identify_trials`.
     """
-    found = identify_trials(job, lambda share: progress(0.8 * share)).main
+    result = identify_trials(job, lambda share: progress(0.8 * share))
+    found = result.main
     if not np.isfinite(found.covariance).all():
         raise ValueError(f"the impedance has no standard errors, and so no posterior: {found.reason}")
     density = estimate_density(found.names, found.units, found.theta, found.covariance, found.dof)
     drawn = sample_posterior(density, ess=job.posterior.ess, seed=job.posterior.seed)
     progress(1.0)
-    return found, derive(drawn, density.elements, density.element_names, density.element_units)
+    return result, derive(drawn, density.elements, density.element_names, density.element_units)

@@ -32,14 +32,12 @@ from typing import Any
 
 from jaximp.jobs.settings import check_keys, settings
 from jaximp.models.kinematics import ArmGeometry
-from jaximp.perturbation.movement_trials import read_movements, read_postures
-from jaximp.perturbation.movements import VOLUNTARY_DELAY, Handle, Movements
+from jaximp.perturbation.reading import TASKS, read_trials
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
 from jaximp.recordings.load import check_mapping, load_recording, load_trial_table
 from jaximp.recordings.readers import FORMATS
 from jaximp.types import Recording, nearest
 
-TASKS = ("movement", "posture")
-"""What the subject does: move and be perturbed at times, or keep a posture."""
 STATIC_WINDOW = 0.4
 """Time after the onset of a perturbed posture from which the inertia is estimated [s]."""
 _POSTURE = ("files", "file", "trial", "onset", "window")
@@ -76,30 +74,11 @@ class TriggerSettings:
 
 
 @dataclass(frozen=True)
-class HandArmSettings:
-    """`[model.arm]` beside `[trials]`: the arm whose hand was recorded."""
-
-    lengths: list[float]
-    """Lengths of upper arm and forearm [m]."""
-    elbow: str = "right"
-    """On which side the elbow lies, seen from the shoulder along the line to the hand: `right` or `left`."""
-    shoulder: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    """Where the shoulder is in the frame of the hand's position [m]."""
-    inertia: list[float] | None = None
-    """Base inertial parameters of Börner et al. 2020, eq. (12): `I_1 + m_2 l1^2, I_2, m_2 c_2 l1` [kg m^2]."""
-    inertia_stderr: list[float] | None = None
-    """Their standard errors [kg m^2]."""
-
-    def geometry(self) -> ArmGeometry:
-        return ArmGeometry(self.lengths, self.elbow, self.shoulder)
-
-
-@dataclass(frozen=True)
 class TrialsSettings:
     """`[trials]`."""
 
     task: str = "movement"
-    """What the subject does: `movement`, or `posture` for postures that are kept and perturbed."""
+    """One of `reading.TASKS`."""
     method: str | list[str] = "output_error"
     """`output_error`, `feedback_jerk`, `gomi_kawato` or `erden_billard`, or a list of several: the first makes the
     report, the others stand beside it."""
@@ -156,19 +135,15 @@ class TrialsSettings:
             return load_trial_table(self.folder / self.file, self.trial, joint="prismatic", **self.mapping)
         return [load_recording(path, joint="prismatic", **self.mapping) for path in self.paths()]
 
-    def load(self, smooth: bool = True) -> tuple[Movements, Movements | None, tuple[str, ...]]:
-        """Perturbed and unperturbed movements, and notes in plain words: see `read_movements` and `read_postures`.
+    def load(self, smooth: bool = True) -> tuple[Trials, Trials | None, tuple[str, ...]]:
+        """Perturbed and unperturbed trials, and notes in plain words: see `read_trials`.
 
-        **Raises:** as those and `load_recording`.
+        **Raises:** as that and `load_recording`.
         """
-        recordings, geometry = self.recordings(), self.geometry
-        if self.task == "posture":
-            postures, notes = read_postures(recordings, onset=self.onset, geometry=geometry, smooth=smooth)
-            return postures, None, notes
         trigger = None if self.trigger is None else (self.trigger.axis - 1, self.trigger.position)
-        return read_movements(
-            recordings, window=self.window, onset=self.onset, trigger=trigger, handle=self.known_handle(),
-            geometry=geometry, smooth=smooth,
+        return read_trials(
+            self.recordings(), self.task, window=self.window, onset=self.onset, trigger=trigger,
+            handle=self.known_handle(), geometry=self.geometry, smooth=smooth,
         )  # fmt: skip
 
 
@@ -216,22 +191,6 @@ def _posture_settings(table: Any, trials: TrialsSettings, columns: list[str]) ->
     _check_files(made, table, "trials.posture")
     _check_window(made.window, "trials.posture")
     return made
-
-
-def arm_settings(table: Any) -> HandArmSettings:
-    """`[model.arm]` of a job with `[trials]`.
-
-    **Raises:** `ValueError` that names the key and the remedy.
-    """
-    arm = settings(HandArmSettings, table, "model.arm")
-    arm.geometry()  # refuses lengths that cannot be
-    for name in ("inertia", "inertia_stderr"):
-        values = getattr(arm, name)
-        if values is not None and (len(values) != 3 or not all(x > 0 and math.isfinite(x) for x in values)):
-            raise ValueError(f"model.arm.{name} is {values}: it must be three numbers above zero, in kg m^2")
-    if arm.inertia_stderr is not None and arm.inertia is None:
-        raise ValueError("model.arm.inertia_stderr needs model.arm.inertia: add it")
-    return arm
 
 
 def _check_files(trials: TrialsSettings, table: Mapping[str, Any], where: str) -> None:

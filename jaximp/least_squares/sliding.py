@@ -92,14 +92,14 @@ def sliding_least_squares(
     **Source:** Tout et al. 2023, III-B.
     """
     given = _given(W, y, window, step, sample_rate, valid, weights)
-    noise = noise if noise is None or is_traced(noise) else np.asarray(noise, given.W.dtype)
-    found = _in_chunks(given, noise)
+    known: Any = noise if noise is None or is_traced(noise) else np.asarray(noise, given.W.dtype)
+    found = _in_chunks(given, known)
     if found is not None:
         return found
     starts, n_windows = given.starts, len(given.starts)
     if room is not None:
         starts = np.pad(starts, (0, len(given.W) // given.step + 1 - n_windows), mode="edge")
-    fit = _solve_all(*given[:3], noise, jnp.asarray(starts), given.window, room or given.window)
+    fit = _solve_all(*given[:3], known, jnp.asarray(starts), given.window, room or given.window)
     return fit if room is None else _first_windows(fit, n_windows)
 
 
@@ -161,7 +161,7 @@ def adaptive_least_squares(
     shortest: float,
     longest: float,
     *,
-    cond: float = np.inf,
+    cond: float | AnyArray = np.inf,
     step: float | None = None,
     sample_rate: float | None = None,
     valid: Shaped[AnyArray, "..."] | None = None,

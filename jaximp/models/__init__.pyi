@@ -1,9 +1,7 @@
 from .arm import ArmLinks as ArmLinks
 from .arm import PlanarArm as PlanarArm
-from .arm import borner_from_lakatos as borner_from_lakatos
 from .arm import coriolis_matrix as coriolis_matrix
 from .arm import gravity_torque as gravity_torque
-from .arm import lakatos_from_borner as lakatos_from_borner
 from .arm import mass_matrix as mass_matrix
 from .arm import rigid_body_torque as rigid_body_torque
 from .base import MOTION as MOTION
@@ -20,6 +18,10 @@ from .endpoint import endpoint_impedance as endpoint_impedance
 from .endpoint import endpoint_inertia as endpoint_inertia
 from .endpoint import endpoint_stiffness as endpoint_stiffness
 from .endpoint import propagated_stderr as propagated_stderr
+from .inertia import BASE_INERTIA as BASE_INERTIA
+from .inertia import BaseInertia as BaseInertia
+from .inertia import borner_from_lakatos as borner_from_lakatos
+from .inertia import lakatos_from_borner as lakatos_from_borner
 from .joint import HumanJoint as HumanJoint
 from .joint import RobotJoint as RobotJoint
 from .joint import parameter_units as parameter_units

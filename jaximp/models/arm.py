@@ -3,12 +3,9 @@
 Angles: `q1` of the upper arm from the x axis, `q2` of the forearm from the upper arm, both counterclockwise [rad].
 Where there is gravity it acts along -y, or along x (`zero = "hanging"`: at zero the arm hangs down).
 
-The rigid body is known by three base inertial parameters, of which two conventions are in use. With `I_i` the moment of
-inertia of link i about its own joint, `m_i` its mass, `c_i` the distance of its centre of mass from that joint, and
-`l1` the length of the upper arm:
-
-- Lakatos et al. 2011 (used throughout): `xi = (I_1 + m_2 l1^2 + I_2, m_2 c_2 l1, I_2)` [kg m^2];
-- Börner et al. 2020, eq. (12): `pi = (I_1 + m_2 l1^2, I_2, m_2 c_2 l1)` [kg m^2].
+The rigid body is known by three base inertial parameters. All functions of this file take them as `xi`, in the order of
+Lakatos et al. 2011: `xi = (I_1 + m_2 l1^2 + I_2, m_2 c_2 l1, I_2)` [kg m^2]. `inertia.py` has the other order that is
+in use, and `BaseInertia`, which has names in place of an order: `BaseInertia(...).lakatos` is an `xi`.
 """
 
 from __future__ import annotations
@@ -35,7 +32,8 @@ class PlanarArm(Model):
     `torque = M(q) ddq + C(q, dq) dq + D dq + K (q - equilibrium)`, the torque that an outside force applies to the
     joints, and after it, where asked for, gravity, friction and constants:
 
-    - `inertia_1` to `inertia_3`: the base inertial parameters xi [kg m^2];
+    - `inertia_1` to `inertia_3`: the base inertial parameters xi in Lakatos's order, `I_1 + m_2 l1^2 + I_2`,
+      `m_2 c_2 l1` and `I_2` [kg m^2];
     - `damping_11`, `_12`, `_21`, `_22` [N m s/rad] and `stiffness_11` to `_22` [N m/rad], row by row;
     - `gravity_1 = m_1 c_1 + m_2 l1` and `gravity_2 = m_2 c_2` [kg m], on `g cos q1` and `g cos(q1 + q2)`, for an arm
       in the vertical plane with `q1` from the horizontal (sines where it is from the vertical, `zero = "hanging"`): the
@@ -189,20 +187,8 @@ class ArmLinks:
         return jnp.array([m1 * c1 + m2 * self.lengths[0], m2 * c2])
 
 
-def borner_from_lakatos(xi: Num[AnyArray, "*M 3"]) -> Float[Array, "*M 3"]:
-    """Base inertial parameters [kg m^2] as Börner et al. 2020, eq. (12), order them, from those of Lakatos et al."""
-    xi = jnp.asarray(xi)
-    return jnp.stack([xi[..., 0] - xi[..., 2], xi[..., 2], xi[..., 1]], axis=-1)
-
-
-def lakatos_from_borner(pi: Num[AnyArray, "*M 3"]) -> Float[Array, "*M 3"]:
-    """Base inertial parameters [kg m^2] as in eq. (13) of Lakatos et al. 2011, from those of Börner et al. 2020."""
-    pi = jnp.asarray(pi)
-    return jnp.stack([pi[..., 0] + pi[..., 1], pi[..., 2], pi[..., 1]], axis=-1)
-
-
 def mass_matrix(q: Num[ArrayLike, "... 2"], xi: Num[AnyArray, "3"]) -> Float[Array, "... 2 2"]:
-    """Mass matrix M [kg m^2] at the angles `q` [rad], from base parameters `xi`: Lakatos et al. 2011, eq. (13)."""
+    """Mass matrix M [kg m^2] at the angles `q` [rad], from base parameters `xi` in Lakatos's order: eq. (13) there."""
     _, cosine = sine_and_cosine(jnp.asarray(q)[..., 1])
     coupled = xi[2] + xi[1] * cosine
     return _matrix(xi[0] + 2 * xi[1] * cosine, coupled, coupled, jnp.full_like(coupled, xi[2]))
@@ -211,7 +197,8 @@ def mass_matrix(q: Num[ArrayLike, "... 2"], xi: Num[AnyArray, "3"]) -> Float[Arr
 def coriolis_matrix(
     q: Num[ArrayLike, "... 2"], dq: Num[ArrayLike, "... 2"], xi: Num[AnyArray, "3"]
 ) -> Float[Array, "... 2 2"]:
-    """Coriolis and centrifugal matrix C [N m s/rad] with `dM/dt - 2 C` skew symmetric: Lakatos et al. 2011, eq. (1)."""
+    """Coriolis and centrifugal matrix C [N m s/rad] with `dM/dt - 2 C` skew symmetric, from base parameters `xi` in
+    Lakatos's order [kg m^2]: eq. (1) there."""
     dq = jnp.asarray(dq)
     sine, _ = sine_and_cosine(jnp.asarray(q)[..., 1])
     h = xi[1] * sine
@@ -239,8 +226,8 @@ def rigid_body_torque(
     Where the inertia is known, the torque less this one is what damping and stiffness explain, for
     `PlanarArm(equilibrium, inertia=False)`.
 
-    **Arguments:** angles `q` [rad], velocities `dq`, accelerations `ddq`; `xi` base parameters [kg m^2] and `gravity`
-    of the arm; `g` [m/s^2].
+    **Arguments:** angles `q` [rad], velocities `dq`, accelerations `ddq`; `xi` base parameters in Lakatos's order
+    [kg m^2], as `PlanarArm` estimates them, and `gravity` [kg m] of the arm; `g` [m/s^2].
 
     **Source:** Lakatos et al. 2011, eqs. (1) and (24).
     """

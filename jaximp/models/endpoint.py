@@ -25,8 +25,9 @@ Values = TypeVar("Values")
 def endpoint_inertia(
     geometry: ArmGeometry, q: Num[ArrayLike, "... 2"], xi: Num[AnyArray, "3"]
 ) -> Float[Array, "... 2 2"]:
-    """Inertia at the hand [kg] at the angles `q` [rad], from base parameters `xi` [kg m^2]; NaN or huge where the arm
-    is straight or folded, as for damping and stiffness."""
+    """Inertia at the hand [kg] at the angles `q` [rad], from base parameters `xi` in the order of Lakatos et al. 2011
+    [kg m^2] (`PlanarArm`, `BaseInertia.lakatos`); NaN or huge where the arm is straight or folded, as for damping and
+    stiffness."""
     return _at_the_hand(geometry, q, mass_matrix(q, xi))
 
 
@@ -79,7 +80,10 @@ def endpoint_impedance(
     K: Num[AnyArray, "... 2 2"],
     force: Num[ArrayLike, "... 2"] | None = None,
 ) -> EndpointImpedance:
-    """Inertia, damping and stiffness at the hand: `endpoint_inertia`, `endpoint_damping` and `endpoint_stiffness`."""
+    """Inertia, damping and stiffness at the hand: `endpoint_inertia`, `endpoint_damping` and `endpoint_stiffness`.
+
+    **Arguments:** those of these three; `xi` base parameters in the order of Lakatos et al. 2011 [kg m^2].
+    """
     return EndpointImpedance(
         endpoint_inertia(geometry, q, xi), endpoint_damping(geometry, q, D), endpoint_stiffness(geometry, q, K, force)
     )

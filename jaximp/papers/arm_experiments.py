@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PRNGKeyArray
 from numpy.typing import NDArray
 
-from jaximp.models.arm import ArmLinks, borner_from_lakatos, rigid_body_torque
-from jaximp.perturbation.isolation import in_window
-from jaximp.perturbation.movements import VOLUNTARY_DELAY, Deviations, Movements
+from jaximp.models.arm import ArmLinks, rigid_body_torque
+from jaximp.models.inertia import borner_from_lakatos
+from jaximp.perturbation.deviations import Deviations
+from jaximp.perturbation.stiffness import symmetric_matrix
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials, in_window
 from jaximp.simulation.neuromuscular import (
     ANGLES,
     POSTURES,
@@ -52,13 +54,13 @@ class Case(NamedTuple):
 class Experiment(eqx.Module):
     """The dynamic and the static task of one simulation."""
 
-    perturbed: Movements
+    perturbed: Trials
     """60 trials."""
-    twins: Movements
+    twins: Trials
     """The same trials without the perturbation."""
-    unperturbed: Movements | None
+    unperturbed: Trials | None
     """Other trials of the same task, as an experiment has them."""
-    postures: Movements | None
+    postures: Trials | None
     """100 trials of the static task, where it was done."""
     stiffness: Float[Array, "*S T 3"]
     """True K11, K12, K22 [N m/rad], mean over the window of each trial, without the perturbation."""
@@ -94,7 +96,7 @@ def _simulate(
     forces = jax.vmap(perturbing_forces)(parts[:, 0])
     noise = jax.vmap(lambda key: noise_of(key, forces.shape[1]))(parts[:, 1])
 
-    def trials(forces: Array, noise: Array) -> tuple[Movements, Array]:
+    def trials(forces: Array, noise: Array) -> tuple[Trials, Array]:
         """All trials of all simulations side by side."""
         flat = reach(arm, task, forces.reshape(-1, 2), noise.reshape(-1, *noise.shape[2:]))
         apart = jax.tree.map(lambda x: x.reshape(S, -1, *x.shape[1:]), flat)
@@ -107,7 +109,7 @@ def _simulate(
         more = jax.vmap(lambda key: noise_of(key, others))(parts[:, 2])
         unperturbed, _ = trials(jnp.zeros((S, others, 2)), more)
 
-    def hold(key: PRNGKeyArray) -> Movements:
+    def hold(key: PRNGKeyArray) -> Trials:
         held = neural_noise(key, 100, round(1.5 * RATE), case.amplitude, case.cutoff)
         return hold_posture(arm, np.repeat(POSTURES, 20, axis=0), np.tile(ANGLES, 5), held)
 
@@ -141,7 +143,7 @@ def normalised_errors(true: Deviations, found: Deviations) -> Numbers:
 
 def as_matrix(K: Num[AnyArray, "*N 3"]) -> Numbers:
     """(*N, 2, 2) symmetric matrices from their elements 11, 12, 22."""
-    return np.asarray(K)[..., [0, 1, 1, 2]].reshape(*np.shape(K)[:-1], 2, 2)
+    return np.asarray(symmetric_matrix(np.asarray(K)))
 
 
 def groups(trials: int) -> NDArray[np.int64]:
@@ -152,7 +154,7 @@ def groups(trials: int) -> NDArray[np.int64]:
 @eqx.filter_jit
 def replayed_torque(
     arm: NeuromuscularArm,
-    unperturbed: Movements,
+    unperturbed: Trials,
     command: Num[AnyArray, "T S 2"],
     inertia: Num[AnyArray, "3"],
     D: Num[AnyArray, "T 2 2"],
@@ -161,7 +163,7 @@ def replayed_torque(
     """Deviation of the external torque [N m] of an arm with other inertia and impedance, pushed alike: Table 2B.
 
     **Arguments:** `unperturbed` trials, cut to the window, from which the muscles deviate by D and K alone; `command`
-    the perturbing force [N] in the window; `inertia` of eq. (12) [kg m^2]; D and K one for each trial.
+    the perturbing force [N] in the window; `inertia` in the order of eq. (12) [kg m^2]; D and K one for each trial.
     """
     geometry = arm.geometry
     q, dq, ddq = geometry.joint_motion(unperturbed.position, unperturbed.velocity, unperturbed.acceleration)

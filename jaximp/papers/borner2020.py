@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp import plots
-from jaximp.models.arm import lakatos_from_borner
 from jaximp.models.endpoint import EndpointImpedance, endpoint_impedance
+from jaximp.models.inertia import lakatos_from_borner
 from jaximp.motion.trajectories import RaisedSine, jerk
 from jaximp.papers.arm_experiments import (
     QUANTITIES,
@@ -32,19 +32,13 @@ from jaximp.papers.arm_experiments import (
     subject,
     true_deviations,
 )
-from jaximp.perturbation.isolation import (
-    METHODS,
-    Isolated,
-    KnownArm,
-    Method,
-    energy_spectra,
-    in_window,
-    joint_deviations,
-    static_fit,
-    static_inertia,
-)
-from jaximp.perturbation.movements import VOLUNTARY_DELAY
+from jaximp.perturbation.deviations import KnownArm, joint_deviations
+from jaximp.perturbation.isolation.feedback_jerk import energy_spectra
+from jaximp.perturbation.isolation.isolated import Isolated
+from jaximp.perturbation.isolation.methods import METHODS, Method
+from jaximp.perturbation.static import static_fit, static_inertia
 from jaximp.perturbation.stiffness import fit_triangles, fit_triangles_linear, residual_triangle
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, in_window
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach
 from jaximp.types import Numbers, Progress
 

@@ -25,7 +25,7 @@ from jaximp.design.perturbations import condition_of, design_perturbations
 from jaximp.identification.filters import FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk, SixthOrder, Trajectory, jerk
-from jaximp.perturbation.trials import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials
+from jaximp.perturbation.regression import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials
 from jaximp.simulation.held_arm import DIRECTIONS, HeldArm, HeldTrials, hold, imposed_motion
 from jaximp.trust.criteria import confidence, matrix_criteria
 from jaximp.trust.limits import TrustLimits

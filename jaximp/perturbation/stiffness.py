@@ -39,7 +39,14 @@ REASONS = (
 )
 """Why a fit failed, by its `reason`."""
 
-ELEMENTS = ("D11", "D12", "D21", "D22", "K11", "K12", "K21", "K22")
+MATRICES = {"damping": "N m s/rad", "stiffness": "N m/rad"}
+"""What the torque of a deviation is made of, and its unit."""
+PARTS = tuple((matrix, i, j) for matrix in MATRICES for i in (1, 2) for j in (1, 2))
+ELEMENTS = tuple(f"{matrix}_{i}{j}" for matrix, i, j in PARTS)
+"""`damping_11` to `stiffness_22`, row by row: the torque of joint i for the motion of joint j, as in `PlanarArm`."""
+MATRIX_OF = dict(zip(ELEMENTS, (matrix for matrix, _, _ in PARTS), strict=True))
+SYMMETRIC_ELEMENTS = tuple(name for name in ELEMENTS if name != "stiffness_21")
+"""Where the stiffness is symmetric: its elements 11, 12 and 22."""
 # Each row an element, each column a parameter; where K is constrained its parameters are the last three.
 SYMMETRIC = np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1]])
 EIGHT = np.eye(8)
@@ -74,7 +81,7 @@ class LinearFit(eqx.Module):
 
     @property
     def theta(self) -> Float[Array, "*B p"]:
-        """D11, D12, D21, D22, K11, K12, K21, K22; K21 only where K need not be symmetric."""
+        """`ELEMENTS`, or where K is symmetric `SYMMETRIC_ELEMENTS`."""
         full = jnp.concatenate([self.D.reshape(*self.D.shape[:-2], 4), self.K.reshape(*self.K.shape[:-2], 4)], axis=-1)
         return full[..., _given(self.covariance.shape[-1])]
 
@@ -91,7 +98,7 @@ class LinearFit(eqx.Module):
 class StiffnessFit(LinearFit):
     """Damping, and a stiffness that is symmetric and positive semidefinite.
 
-    The covariance, of (D11, D12, D21, D22, K11, K12, K22), is that of the estimate without the demand of definiteness.
+    The covariance, of `SYMMETRIC_ELEMENTS`, is that of the estimate without the demand of definiteness.
     Where this holds the estimate (`on_boundary`) it is too large rather than too small: the estimate is the other one's
     projection onto a convex set, which brings no two points further apart.
     """
@@ -349,9 +356,14 @@ def _results(problem: _Problem, theta: Array, elements: NDArray[np.float64]) -> 
     }
 
 
+def symmetric_matrix(elements: Num[AnyArray, "*N 3"]) -> Any:
+    """(*N, 2, 2) of its elements 11, 12 and 22."""
+    return elements[..., np.array([[0, 1], [1, 2]])]
+
+
 def _given(n: int) -> NDArray[np.int64]:
-    """Which of `ELEMENTS` stand for the matrices: without K21 where it is K12."""
-    return np.arange(8) if n == 8 else np.delete(np.arange(8), ELEMENTS.index("K21"))
+    """Which of `ELEMENTS` stand for the matrices."""
+    return np.arange(8) if n == 8 else np.array([ELEMENTS.index(name) for name in SYMMETRIC_ELEMENTS])
 
 
 def _times(a: AnyArray, b: AnyArray) -> Array:
@@ -363,10 +375,10 @@ def element_columns(R: Array, elements: NDArray[np.float64]) -> Array:
     """(p + 1, 12) columns of the parameters and of the torque: six rows for each joint."""
     zero = jnp.zeros_like(R[:, 0])
     column = {
-        f"{matrix}{joint + 1}{other + 1}": jnp.concatenate(
+        f"{matrix}_{joint + 1}{other + 1}": jnp.concatenate(
             [zero] * joint + [R[:, start + other]] + [zero] * (1 - joint)
         )
-        for matrix, start in (("D", 0), ("K", 2))
+        for matrix, start in (("damping", 0), ("stiffness", 2))
         for joint in (0, 1)
         for other in (0, 1)
     }

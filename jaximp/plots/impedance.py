@@ -9,9 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaximp.perturbation.impedance import ArmImpedance, OtherWindows
-from jaximp.perturbation.isolation import METHODS
-from jaximp.perturbation.movements import VOLUNTARY_DELAY
+from jaximp.perturbation.impedance import ArmImpedance
+from jaximp.perturbation.isolation.methods import METHODS
+from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
+from jaximp.perturbation.trials import VOLUNTARY_DELAY
+from jaximp.perturbation.windows import OtherWindows
 from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, pretty_unit, styled
 from jaximp.types import Numbers
 
@@ -19,8 +21,6 @@ SHOWN = 4
 """Trials whose torque is drawn."""
 HIGHEST = 12.0
 """Of the spectra [Hz]: a movement, its surroundings, and where the high-pass cuts."""
-ORDER = ("D11", "D12", "D21", "D22", "K11", "K12", "K21", "K22")
-MATRICES = {"D": "damping", "K": "stiffness"}
 
 
 @styled
@@ -31,7 +31,7 @@ def deviations(found: ArmImpedance) -> Figure:
     quantities = (("position", 1e3, "mm"), ("force", 1.0, "N"))
     for row, (name, scale, unit) in zip(panels, quantities, strict=True):
         for k, (panel, axis) in enumerate(zip(row, "xy", strict=True)):
-            values = scale * np.asarray(getattr(found.deviations, name), np.float64)[..., k]
+            values = scale * np.asarray(getattr(found.curves.deviations, name), np.float64)[..., k]
             time = _milliseconds(values.shape[1], found)
             for j, trial in enumerate(values):
                 color, style = LINES[j % 4]
@@ -72,7 +72,7 @@ def jerk_spectra(spectra: tuple[Numbers, Numbers, Numbers], cutoff: Numbers | No
 @styled
 def joint_torques(found: ArmImpedance) -> Figure:
     """Isolated torque of both joints against that of damping and stiffness, in a few trials."""
-    torque, model = np.asarray(found.joint.torque), found.model_torque()
+    torque, model = np.asarray(found.curves.joint.torque), found.curves.model_torque(found.D, found.K)
     trials = np.unique(np.linspace(0, len(torque) - 1, SHOWN).astype(int))
     figure = Figure(figsize=(WIDTH, 3.6))
     panels = figure.subplots(2, len(trials), sharex=True, sharey="row", squeeze=False)
@@ -112,7 +112,7 @@ def impedance_windows(windows: OtherWindows, chosen: float, level: float = 0.95)
         at_chosen = int(np.abs(windows.window - chosen).argmin())
         panel.set(xlim=(length[0], length[-1]), ylim=_limits(theta, low[:, k], high[:, k], at_chosen))
     for name in windows.names:
-        if name[0] == "K":
+        if MATRIX_OF[name] == "stiffness":
             panels[name].set_xlabel("window [ms]")
     _legend_below(figure, panels[windows.names[0]])
     return figure
@@ -121,7 +121,7 @@ def impedance_windows(windows: OtherWindows, chosen: float, level: float = 0.95)
 @styled
 def impedance_methods(several: Sequence[ArmImpedance], level: float = 0.95) -> Figure:
     """Every element by several methods, with its interval; pale where the estimate is not trusted."""
-    names = [name for name in ORDER if any(name in one.names for one in several)]
+    names = [name for name in ELEMENTS if any(name in one.names for one in several)]
     figure = Figure(figsize=(WIDTH, 3.8))
     panels = _element_panels(figure, names)
     for name in names:
@@ -142,7 +142,7 @@ def impedance_methods(several: Sequence[ArmImpedance], level: float = 0.95) -> F
 
 def _milliseconds(samples: int, found: ArmImpedance) -> Numbers:
     """Since the onset."""
-    return np.asarray(1e3 * np.arange(samples) / found.sample_rate, np.float64)
+    return np.asarray(1e3 * np.arange(samples) / found.curves.sample_rate, np.float64)
 
 
 def _element_panels(figure: Figure, names: Sequence[str]) -> dict[str, Axes]:
@@ -150,15 +150,14 @@ def _element_panels(figure: Figure, names: Sequence[str]) -> dict[str, Axes]:
     columns = 4
     panels = figure.subplots(2, columns, sharex=True)
     found: dict[str, Axes] = {}
-    for row, letter in zip(panels, MATRICES, strict=True):
-        wanted = [name for name in ORDER if name in names and name[0] == letter]
-        unit = "N m s/rad" if letter == "D" else "N m/rad"
+    for row, (matrix, unit) in zip(panels, MATRICES.items(), strict=True):
+        wanted = [name for name in ELEMENTS if name in names and MATRIX_OF[name] == matrix]
         for panel, name in zip(row, wanted, strict=False):
-            panel.set_title(f"{name[0]}{name[1:]}", loc="left")
+            panel.set_title(name.replace("_", " "), loc="left")
             found[name] = panel
         for panel in row[len(wanted) :]:
             panel.remove()
-        row[0].set_ylabel(f"{MATRICES[letter]} [{pretty_unit(unit)}]")
+        row[0].set_ylabel(f"{matrix} [{pretty_unit(unit)}]")
         if len(wanted) < columns:  # the panel above the missing one has the ticks of its column
             panels[0, -1].tick_params(labelbottom=True)
     figure.align_ylabels()

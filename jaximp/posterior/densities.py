@@ -25,7 +25,15 @@ from jaximp.least_squares.noise import WhiteRows, triangles
 from jaximp.numerics.definite import eigenvalues
 from jaximp.numerics.linear_algebra import back_substitute, cholesky, triangle
 from jaximp.numerics.precision import require_float64
-from jaximp.perturbation.stiffness import ELEMENTS, FEWEST_TRIALS, SEVEN, element_columns
+from jaximp.perturbation.stiffness import (
+    FEWEST_TRIALS,
+    MATRICES,
+    MATRIX_OF,
+    SEVEN,
+    SYMMETRIC_ELEMENTS,
+    element_columns,
+    symmetric_matrix,
+)
 from jaximp.posterior.predictive import NU, student
 from jaximp.posterior.priors import Prior, make_prior
 from jaximp.types import AnyArray, Numbers
@@ -36,9 +44,9 @@ NO_NOISE = 1e-12
 """Residuals that are smaller than this share of the torque are taken as rounding."""
 STEPS, DECREMENT = 60, 1e-14
 """Of Newton's method: how many at most, and the squared distance from the mode, in standard deviations, at its end."""
-STIFFNESS = tuple(name for name in ELEMENTS if name != "K21")
+STIFFNESS = SYMMETRIC_ELEMENTS
 FACTOR = ("l11", "l21", "l22")
-UNITS = ("N m s/rad",) * 4 + ("N m/rad",) * 3
+UNITS = tuple(MATRICES[MATRIX_OF[name]] for name in STIFFNESS)
 FACTOR_UNITS = ("N m s/rad",) * 4 + ("(N m/rad)^0.5",) * 3
 K = slice(4, 7)
 """The parameters of a stiffness among all elements."""
@@ -126,7 +134,7 @@ class Density(eqx.Module):
     """Of the parameters; K = L L' has l11, l21 and l22, of which the first and the last are positive."""
     units: tuple[str, ...] = eqx.field(static=True)
     definite: bool = eqx.field(static=True, default=False)
-    """Elements 4 to 6 are K11, K12, K22 of a positive definite stiffness."""
+    """Elements 4 to 6 are those of a positive definite stiffness K, `stiffness_11`, `_12` and `_22`."""
 
     @property
     def element_names(self) -> tuple[str, ...]:
@@ -149,7 +157,7 @@ class Density(eqx.Module):
         return jnp.where(inside & jnp.isfinite(value), value, -jnp.inf)
 
     def elements(self, theta: Num[AnyArray, "*draws P"]) -> Float[Array, "*draws P"]:
-        """Parameters with K11, K12, K22 in place of the factor of K; for one vector, or samples."""
+        """Parameters with the elements of K in place of its factor; for one vector, or samples."""
         theta = jnp.asarray(theta)
         if not self.definite:
             return theta
@@ -262,7 +270,7 @@ def stiffness_density(
     independent; those of perturbation trials are not, see `adjusted`.
 
     **Arguments:** the triangle of `stiffness.residual_triangle`, of one trial or merged; its samples, each of them two
-    torques; `prior` of D11 to K22 and log_noise.
+    torques; `prior` of `damping_11` to `stiffness_22` and `log_noise`.
 
     **Source:** Börner et al. 2020, eqs. (36) to (38).
     """
@@ -287,8 +295,8 @@ def estimate_density(
 ) -> Density:
     """Log density of parameters of which an estimate, its covariance and its degrees of freedom are known.
 
-    Student's t around the estimate. Where the parameters are D11 to K22 with a symmetric stiffness, that must be
-    positive definite, and is sampled by its factor.
+    Student's t around the estimate. Where the parameters are those of `STIFFNESS`, K must be positive
+    definite, and is sampled by its factor.
 
     **Raises:** ValueError for an estimate without a covariance.
     """
@@ -313,7 +321,7 @@ def adjusted(density: Density, covariance: Num[AnyArray, "q q"]) -> Density:
     independent residuals. A covariance from few trials is itself uncertain, which `estimate_density` knows and this
     does not.
 
-    **Arguments:** covariance of the first q elements (D11, ..., K22).
+    **Arguments:** covariance of the first q elements (`damping_11` to `stiffness_22`).
 
     **Source:** Ribatet, Cooley and Davison 2012, section 2.2.
     """
@@ -333,10 +341,10 @@ def noise_names(n: int) -> tuple[str, ...]:
 
 
 def stiffness_matrices(elements: Num[AnyArray, "*draws P"]) -> tuple[Numbers, Numbers]:
-    """Damping and stiffness (*draws, 2, 2) of samples of elements D11, D12, D21, D22, K11, K12, K22, ..."""
+    """Damping and stiffness (*draws, 2, 2) of samples of the elements `STIFFNESS`, and whatever follows them."""
     x = np.asarray(elements)
     shape = (*x.shape[:-1], 2, 2)
-    return x[..., :4].reshape(shape), x[..., [4, 5, 5, 6]].reshape(shape)
+    return x[..., :4].reshape(shape), symmetric_matrix(x[..., K])
 
 
 @eqx.filter_jit

@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from jaximp import plots
 from jaximp.jobs.job import Job
+from jaximp.jobs.run_trials import TrialsResult
 from jaximp.models.endpoint import (
     Ellipse,
     EndpointImpedance,
@@ -25,9 +26,11 @@ from jaximp.models.endpoint import (
     endpoint_stiffness,
     propagated_stderr,
 )
-from jaximp.perturbation.impedance import ArmImpedance, TrialsResult
-from jaximp.perturbation.isolation import METHODS
-from jaximp.perturbation.output_error import MISFIT
+from jaximp.models.inertia import BASE_INERTIA
+from jaximp.perturbation.impedance import ArmImpedance
+from jaximp.perturbation.isolation.methods import METHODS
+from jaximp.perturbation.isolation.output_error import MISFIT
+from jaximp.perturbation.stiffness import MATRICES
 from jaximp.reports.pages import (
     inline,
     percent,
@@ -85,7 +88,7 @@ def draw_figures(result: TrialsResult) -> dict[str, bytes]:
         main.arm.geometry, main.angles, {METHODS[one.method].short: _at_hand(one) for one in result.estimates}
     )
     if result.spectra is not None:
-        cutoff = next((one.cutoff for one in result.estimates if one.cutoff is not None), None)
+        cutoff = next((one.curves.cutoff for one in result.estimates if one.curves.cutoff is not None), None)
         figures["spectra"] = plots.jerk_spectra(result.spectra, cutoff)
     if result.windows is not None:
         figures["windows"] = plots.impedance_windows(result.windows, main.window)
@@ -102,7 +105,12 @@ def write_report(path: str | Path, result: TrialsResult, job: Job, figures: Mapp
     images = draw_figures(result) if figures is None else figures
     content = summary(result, job)
     page = template("impedance.jinja").render(
-        content=content, titles=TITLES, figures=inline(images, CAPTIONS), settings=_settings(content)
+        content=content,
+        words=in_words,
+        made_of=BASE_INERTIA,
+        titles=TITLES,
+        figures=inline(images, CAPTIONS),
+        settings=_settings(content),
     )
     Path(path).write_text(page, encoding="utf-8")
 
@@ -116,12 +124,13 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
     handle = result.main.arm.handle
     content = {
         **_result(result.main),
+        "notes": list(result.notes),
         "further_methods": [_result(one) for one in result.estimates[1:]],
         "window_lengths": _windows(result),
         "endpoint": endpoint(result.main),
         "recording": {
             "name": _name(job),
-            "sample_rate_hz": result.main.sample_rate,
+            "sample_rate_hz": result.main.curves.sample_rate,
             "perturbed": result.main.trials,
             "unperturbed": result.main.unperturbed,
             "postures": result.postures,
@@ -143,13 +152,13 @@ def endpoint(found: ArmImpedance) -> dict[str, Any]:
     """Impedance at the hand where it was at the onset, and its ellipses, with the standard errors of D and K."""
     at_hand = _at_hand(found)
     content: dict[str, Any] = {"position_m": found.position.tolist(), "angles_rad": found.angles.tolist()}
-    for name, unit, letter in (("inertia", "kg", ""), ("damping", "Ns_per_m", "D"), ("stiffness", "N_per_m", "K")):
+    for name, unit in (("inertia", "kg"), ("damping", "Ns_per_m"), ("stiffness", "N_per_m")):
         matrix = getattr(at_hand, name)
         content[f"{name}_{unit}"] = np.asarray(matrix).tolist()
         content[f"{name}_ellipse"] = _in_plain_numbers(ellipse(matrix))
-        if letter:
+        if name in MATRICES:
             spread = propagated_stderr(
-                partial(_ellipse_of, found, letter), jnp.asarray(found.theta), jnp.asarray(found.covariance)
+                partial(_ellipse_of, found, name), jnp.asarray(found.theta), jnp.asarray(found.covariance)
             )
             content[f"{name}_ellipse_stderr"] = _in_plain_numbers(spread)
     return content
@@ -159,12 +168,17 @@ def _at_hand(found: ArmImpedance) -> EndpointImpedance:
     return endpoint_impedance(found.arm.geometry, found.angles, found.improved.xi, found.D, found.K)
 
 
-def _ellipse_of(found: ArmImpedance, letter: str, theta: Array) -> Ellipse:
+def _ellipse_of(found: ArmImpedance, matrix: str, theta: Array) -> Ellipse:
     """At the hand, of the damping or stiffness among estimates."""
     at = {name: theta[k] for k, name in enumerate(found.names)}
-    rows = [[at.get(f"{letter}{i}{j}", at[f"{letter}12"]) for j in (1, 2)] for i in (1, 2)]
-    of_hand = endpoint_damping if letter == "D" else endpoint_stiffness
+    rows = [[at.get(f"{matrix}_{i}{j}", at[f"{matrix}_12"]) for j in (1, 2)] for i in (1, 2)]
+    of_hand = endpoint_damping if matrix == "damping" else endpoint_stiffness
     return ellipse(of_hand(found.arm.geometry, jnp.asarray(found.angles), jnp.array(rows)))
+
+
+def in_words(name: str) -> str:
+    """A parameter as a person reads it: `upper_arm_inertia` is the upper arm's inertia."""
+    return name.replace("_", " ")
 
 
 def _in_plain_numbers(one: Ellipse) -> dict[str, float]:
@@ -183,19 +197,18 @@ def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
     for name, unit in sorted(units.items()):
         for ending, values in (("", "theta"), ("_stderr", "stderr")):
             columns.append((name + ending, unit, [_element(one, name, getattr(one, values)) for one in several]))
-    for k in range(3):
-        stderr = [np.nan if one.inertia_stderr is None else one.inertia_stderr[k] for one in several]
+    for name in BASE_INERTIA:
         columns += [
-            (f"inertia_{k + 1}", "kg m^2", [one.inertia[k] for one in several]),
-            (f"inertia_{k + 1}_stderr", "kg m^2", stderr),
+            (name, "kg m^2", [one.inertia[name] for one in several]),
+            (f"{name}_stderr", "kg m^2", [one.inertia_stderr[name] for one in several]),
         ]
     columns += [
         ("unperturbed", "1", [one.unperturbed for one in several]),
         ("delay_s", "s", [np.nan if one.own is None else float(one.own.delay) for one in several]),
         ("misfit", "1", [np.nan if one.misfit is None else one.misfit for one in several]),
         ("dof", "1", [one.dof for one in several]),
-        ("explained", "1", [one.explained for one in several]),
-        ("held_out", "1", [one.held_out for one in several]),
+        ("vaf", "1", [one.vaf for one in several]),
+        ("held_out_vaf", "1", [one.held_out_vaf for one in several]),
         ("verdict", "", [one.verdict for one in several]),
         ("reason", "", [one.reason for one in several]),
     ]
@@ -203,8 +216,8 @@ def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
 
 
 def _element(found: ArmImpedance, name: str, values: Numbers) -> float:
-    """K21 is K12 where a method makes the stiffness symmetric."""
-    return float(values[found.names.index(name if name in found.names else "K12")])
+    """Where a method makes the stiffness symmetric, element 21 is element 12."""
+    return float(values[found.names.index(name if name in found.names else "stiffness_12")])
 
 
 def _result(found: ArmImpedance) -> dict[str, Any]:
@@ -219,7 +232,6 @@ def _result(found: ArmImpedance) -> dict[str, Any]:
         "verdict": found.verdict,
         "reason": found.reason,
         "warnings": list(found.warnings),
-        "notes": list(found.notes),
         "parameters": {
             name: {
                 "unit": found.units[k],
@@ -235,15 +247,15 @@ def _result(found: ArmImpedance) -> dict[str, Any]:
         "dof": found.dof,
         "damping_Nms_per_rad": found.D.tolist(),
         "stiffness_Nm_per_rad": found.K.tolist(),
-        "stiffness_on_boundary": found.on_boundary,
-        "inertia_kgm2": found.inertia.tolist(),
-        "inertia_stderr_kgm2": None if found.inertia_stderr is None else found.inertia_stderr.tolist(),
-        "explained_share": found.explained,
-        "held_out_share": found.held_out,
+        "stiffness_on_boundary": found.evidence.on_boundary,
+        "inertia_kgm2": found.inertia,
+        "inertia_stderr_kgm2": found.inertia_stderr,
+        "vaf": found.vaf,
+        "held_out_vaf": found.held_out_vaf,
         "misfit": found.misfit,
         "delay_s": None if found.own is None else float(found.own.delay),
-        "improved_inertia_kgm2": np.asarray(found.improved.inertia, float).tolist(),
-        "cutoff_hz": None if found.cutoff is None else found.cutoff.tolist(),
+        "improved_inertia_kgm2": found.improved_inertia,
+        "cutoff_hz": None if found.curves.cutoff is None else found.curves.cutoff.tolist(),
         "hand_at_onset_m": found.position.tolist(),
         "angles_at_onset_rad": found.angles.tolist(),
     }
@@ -279,14 +291,16 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
     """What was read, known and demanded, as a person reads it."""
     recording, arm, limits = content["recording"], content["arm"], content["trust_limits"]
 
-    def numbers(values: list[float], unit: str, errors: list[float] | None = None) -> str:
-        several = [plots.number(value) for value in values]
-        if errors is not None:
-            several = [f"{value} ± {plots.number(error, 2)}" for value, error in zip(several, errors, strict=True)]
-        return f"{', '.join(several)} {unit}"
+    def numbers(values: list[float], unit: str) -> str:
+        return f"{', '.join(plots.number(value) for value in values)} {unit}"
+
+    def known_inertia(name: str) -> str:
+        error = content["inertia_stderr_kgm2"][name]
+        value = plots.number(content["inertia_kgm2"][name])
+        return f"{value} kg m²" if error is None else f"{value} ± {plots.number(error, 2)} kg m²"
 
     cutoff = content["cutoff_hz"]
-    inertia = numbers(content["inertia_kgm2"], "kg m²", content["inertia_stderr_kgm2"])
+    whence = "as given" if arm["inertia_from"] == "given" else f"from {arm['inertia_from']}"
     trials = f"{recording['perturbed']} perturbed, {recording['unperturbed']} unperturbed"
     return {
         "trials": trials + (f", {recording['postures']} perturbed postures" if recording["postures"] else ""),
@@ -296,14 +310,14 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "high-pass of the jerk": "none" if cutoff is None else numbers(cutoff, "Hz"),
         "mean place of the hand at the onset": f"{', '.join(f'{x:.3f}' for x in content['hand_at_onset_m'])} m",
         "lengths of the arm": numbers(arm["lengths_m"], "m"),
-        f"inertia, {'as given' if arm['inertia_from'] == 'given' else 'from ' + arm['inertia_from']}": inertia,
+        **{f"{in_words(name)}, {whence}": known_inertia(name) for name in BASE_INERTIA},
         "mass and damping of the handle": "not stated"
         if arm["handle_mass_kg"] is None
         else f"{numbers(arm['handle_mass_kg'], 'kg')}; {numbers(arm['handle_damping_Ns_per_m'], 'N s/m')}",
         "to be trusted, an estimate needs": f"standard errors below {percent(limits['max_relative_stderr'])} of its "
         "matrix, a stiffness and a damping that are not indefinite, "
         + (
-            f"{percent(limits['min_vaf'])} of the torque explained and predicted"
+            f"{percent(limits['min_vaf'])} of the torque accounted for and predicted"
             if content["misfit"] is None
             else f"residuals at most {MISFIT:g} times as large as expected"
         ),

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaximp import plots
 from jaximp.jobs.job import Job
+from jaximp.jobs.run_trials import TrialsResult
 from jaximp.least_squares.noise import ATTENUATION
-from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.posterior.densities import stiffness_matrices
 from jaximp.posterior.draws import Posterior, summarise
 from jaximp.posterior.files import save_posterior
@@ -67,9 +67,9 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     return _write(folder, content, figures)
 
 
-def write_arm_posterior(folder: str | Path, found: ArmImpedance, posterior: Posterior, job: Job) -> dict[str, Any]:
+def write_arm_posterior(folder: str | Path, result: TrialsResult, posterior: Posterior, job: Job) -> dict[str, Any]:
     """The same for an arm's damping and stiffness from perturbed movements."""
-    folder = Path(folder)
+    folder, found = Path(folder), result.main
     save_posterior(folder / "posterior.nc", posterior)
     D, K = stiffness_matrices(posterior.samples)
     ellipses = {"stiffness": {"arm": K}, "damping": {"arm": D}}
@@ -77,7 +77,7 @@ def write_arm_posterior(folder: str | Path, found: ArmImpedance, posterior: Post
     figures = {"corner": plots.corner(posterior), "ellipses": plots.ellipse_bands(ellipses, units)}
     why = posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
     of = f"the impedance of {found.trials} perturbed movements"
-    content = _content(job, posterior, of, list(posterior.names), [*found.warnings, *found.notes], why)
+    content = _content(job, posterior, of, list(posterior.names), [*found.warnings, *result.notes], why)
     return _write(folder, content | {"changes": []}, figures)
 
 

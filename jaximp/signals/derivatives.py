@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +104,8 @@ def savitzky_golay(
     if len(x) < 2 * half + 1:
         raise ValueError(f"{len(x)} samples are too few for this filter, which has {2 * half + 1}: record longer")
     weights = _polynomial_weights(half, order, derivative) * (sample_rate / half) ** derivative
+    concatenate: Any
+    convolve: Any
     if isinstance(x, jax.Array):
         one = partial(jax.scipy.signal.fftconvolve, mode="valid")
         concatenate, convolve = jnp.concatenate, jax.vmap(one, in_axes=(1, None), out_axes=1)

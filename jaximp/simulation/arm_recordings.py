@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaximp.models.inertia import BASE_INERTIA
 from jaximp.models.kinematics import ArmGeometry
-from jaximp.perturbation.movements import VOLUNTARY_DELAY, Movements
+from jaximp.perturbation.stiffness import symmetric_matrix
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials
 from jaximp.recordings.load import recording_from_arrays, save_trial_table
 from jaximp.simulation.neuromuscular import (
     ANGLES,
@@ -99,7 +101,7 @@ def arm_movements(
     return jax.jit(simulated)()
 
 
-def arm_postures(arm: NeuromuscularArm, seed: int = 0) -> Movements:
+def arm_postures(arm: NeuromuscularArm, seed: int = 0) -> Trials:
     """The static task: every posture with four of the twenty directions, all of them once, at 4 kHz.
 
     The onset is the same in all trials: `STATIC`.
@@ -109,7 +111,7 @@ def arm_postures(arm: NeuromuscularArm, seed: int = 0) -> Movements:
     first, duration = STATIC
     key = jax.random.fold_in(jax.random.key(seed), 1)
 
-    def simulated() -> Movements:
+    def simulated() -> Trials:
         noise = neural_noise(key, len(angles), round((SETTLE + duration) * RATE))
         return hold_posture(arm, postures, angles, noise, onset=SETTLE + first)
 
@@ -117,7 +119,7 @@ def arm_postures(arm: NeuromuscularArm, seed: int = 0) -> Movements:
 
 
 def as_recordings(
-    movements: Movements, sensors: Sensors, seed: int = 0, first: int = 0, every: int = EVERY, static: bool = False
+    movements: Trials, sensors: Sensors, seed: int = 0, first: int = 0, every: int = EVERY, static: bool = False
 ) -> list[Recording]:
     """What sensors record, every n-th sample from the first on: position [m], force [N], and the perturbing force [N]
     as `command`, or in the static task the handle's position [m] as `reference`."""
@@ -177,12 +179,12 @@ def write_arm_recordings(
 
 def true_values(arm: NeuromuscularArm, moved: Reaches, seed: int = 0) -> dict[str, object]:
     """Impedance of the joints in the window after the onset, mean and standard deviation over perturbed movements; the
-    inertia as in Börner et al. 2020, eq. (12); and at the hand, the stiffness at the mean position of the onset."""
+    inertia, by the names of `BASE_INERTIA`; and at the hand, the stiffness at the mean position of the onset."""
     pushed = np.flatnonzero(np.abs(np.asarray(moved.movements.command)).max(axis=(1, 2)) > 0)
     onset, samples = np.asarray(moved.movements.onset)[pushed], round(VOLUNTARY_DELAY * RATE)
     rows = onset[:, None] + np.arange(samples)
     stiffness = np.asarray(moved.stiffness)[pushed[:, None], rows].mean(axis=1)
-    mean, sd = (_symmetric(x) for x in (stiffness.mean(axis=0), stiffness.std(axis=0, ddof=1)))
+    mean, sd = (symmetric_matrix(x) for x in (stiffness.mean(axis=0), stiffness.std(axis=0, ddof=1)))
     place = np.asarray(moved.movements.position)[pushed, onset].mean(axis=0)
     geometry = ArmGeometry(np.asarray(arm.lengths))
     inverse = np.linalg.inv(np.asarray(geometry.jacobian(geometry.inverse(place))))
@@ -194,14 +196,9 @@ def true_values(arm: NeuromuscularArm, moved: Reaches, seed: int = 0) -> dict[st
         "stiffness_sd_over_trials": sd.tolist(),
         "damping_Nms_per_rad": (time * mean).tolist(),
         "damping_sd_over_trials": (time * sd).tolist(),
-        "inertia_kgm2": np.asarray(arm.inertia).tolist(),
+        "inertia_kgm2": dict(zip(BASE_INERTIA, np.asarray(arm.inertia).tolist(), strict=True)),
         "hand_at_onset_m": place.tolist(),
         "stiffness_of_the_hand_N_per_m": (inverse.T @ mean @ inverse).tolist(),
         "perturbed_trials": (pushed + 1).tolist(),
         "onset_s": (onset / RATE).tolist(),
     }
-
-
-def _symmetric(upper: Numbers) -> Numbers:
-    """(2, 2) of K11, K12, K22."""
-    return upper[np.array([[0, 1], [1, 2]])]

@@ -34,7 +34,7 @@ class HeldArm(eqx.Module):
     lengths: tuple[float, float] = eqx.field(static=True, default=(0.29, 0.34))
     """Lengths of upper arm and forearm [m]."""
     inertia: Float[Any, "3"] = array_field(default=(0.26815, 0.08375, 0.07367))
-    """Base inertial parameters xi [kg m^2]; these are the arm of Börner et al. 2020."""
+    """Base inertial parameters in the order of Lakatos et al. 2011 [kg m^2]: the arm of Börner et al. 2020."""
     damping: Float[Any, "2 2"] = array_field(default=((2.42, 1.20), (1.20, 1.42)))
     """Damping before any reflex [N m s/rad]: a choice, a twelfth of the stiffness."""
     stiffness: Float[Any, "2 2"] = array_field(default=((29.05, 14.37), (14.37, 17.08)))

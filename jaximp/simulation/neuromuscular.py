@@ -20,11 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
-from jaximp.models.arm import coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
+from jaximp.models.arm import coriolis_matrix, mass_matrix, rigid_body_torque
+from jaximp.models.inertia import lakatos_from_borner
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.motion.trajectories import MinimumJerk, RaisedSine, array_field
 from jaximp.numerics.linear_algebra import solve_pair
-from jaximp.perturbation.movements import VOLUNTARY_DELAY, Handle, Movements
+from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
 from jaximp.signals.filters import butterworth, filter_from_zero
 from jaximp.types import AnyArray
 
@@ -52,7 +53,7 @@ class NeuromuscularArm(eqx.Module):
     lengths: Float[Any, "2"] = array_field(default=(0.29, 0.34))
     """Lengths of upper arm and forearm [m]."""
     inertia: Float[Any, "3"] = array_field(default=(0.1945, 0.0737, 0.0838))
-    """Base inertial parameters of eq. (12) [kg m^2]: those that the paper prints."""
+    """Base inertial parameters in the order of the paper's eq. (12), `BASE_INERTIA` [kg m^2]: those that it prints."""
     moment_arms: Float[Any, "6 2"] = array_field(
         default=((0.0536, 0), (-0.0536, 0), (0, 0.0316), (0, -0.0267), (0.0386, 0.0427), (-0.0388, -0.0300))
     )
@@ -311,7 +312,7 @@ def accelerate(
 class Reaches(eqx.Module):
     """Simulated movements and the truth behind them."""
 
-    movements: Movements
+    movements: Trials
     stiffness: Float[Array, "*T N 3"]
     """K11, K12, K22 of the joints [N m/rad]; the damping is the arm's `damping_time` of it."""
 
@@ -343,7 +344,7 @@ def reach(arm: NeuromuscularArm, task: Reach, forces: Num[AnyArray, "T 2"], nois
 
     (state, _), samples = jax.lax.scan(advance, (init(arm, first), first), (jnp.arange(len(time)), later))
     x, v, a, command, stiffness = (jnp.moveaxis(x, -1, 0) for x in samples)
-    return Reaches(Movements(x, v, a, arm.handle.force(command, v, a), command, state.onset, RATE), stiffness)
+    return Reaches(Trials(x, v, a, arm.handle.force(command, v, a), command, state.onset, RATE), stiffness)
 
 
 def hold_posture(
@@ -354,7 +355,7 @@ def hold_posture(
     onset: float = 1.0,
     displacement: float = 0.008,
     duration: float = 0.16,
-) -> Movements:
+) -> Trials:
     """The arm keeps a posture while the handle moves out and back, whatever the force: the static task of 2.3.2.
 
     The subject does not intervene: no feedback, and no activation but noise.
@@ -377,7 +378,7 @@ def hold_posture(
     transposed = arm.geometry.jacobian(q).swapaxes(-1, -2)
     force = solve_pair(transposed, rigid_body_torque(q, dq, ddq, arm.xi) - torque)
     first = jnp.full(len(x), round(onset * RATE), jnp.int32)
-    return Movements(x, v, a, force, jnp.zeros_like(x), first, RATE)
+    return Trials(x, v, a, force, jnp.zeros_like(x), first, RATE)
 
 
 def _force_profile(arm: NeuromuscularArm, task: Reach) -> Array:

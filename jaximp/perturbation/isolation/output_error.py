@@ -25,7 +25,7 @@ larger the residuals are, and s at least `RESOLUTION`.
     K(t) = K (1 + kappa (t / window - 1/2)), element by element, and D alike.
 
 The measured motion enters both sides, so that its noise cancels to first order. K is symmetric; the parameters are
-theta = [D (4), K11, K12, K22, kappa (7), pi (3), tau].
+theta = [D (4), K (3), kappa (7), pi (3), tau], see `Theta`.
 
 **Fit.** With `r_i = mu(f_i) - g_i - delta_i` and `S_i` the derivative of delta_i, exact, `W_i = (Sigma + A_i A_i')^-1`
 where A_i lets every trial have an impedance of its own (`SPREAD`), P the inverse covariance of what is known before
@@ -62,10 +62,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer, Num
 
-from jaximp.models.arm import coriolis_matrix, lakatos_from_borner, mass_matrix, rigid_body_torque
+from jaximp.models.arm import coriolis_matrix, mass_matrix, rigid_body_torque
+from jaximp.models.inertia import BaseInertia, lakatos_from_borner
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.numerics.precision import require_float64
-from jaximp.perturbation.movements import HISTORY, VOLUNTARY_DELAY, Deviations, Handle, Movements
+from jaximp.perturbation.deviations import Deviations, KnownArm
+from jaximp.perturbation.isolation.isolated import Impedance, Isolated, known_handle
+from jaximp.perturbation.stiffness import symmetric_matrix
+from jaximp.perturbation.trials import HISTORY, VOLUNTARY_DELAY, Handle, Trials
 from jaximp.types import AnyArray, Numbers
 
 BIN = 0.005
@@ -105,9 +109,39 @@ STEP = 1 / 4000
 MISFIT = 1.5
 """chi2 above which a fit is not ok."""
 
-PAIRS = np.array([0, 1, 1, 2])
-"""Which of K11, K12, K22 an element of a matrix is."""
-KAPPA, INERTIA, DELAY = slice(7, 14), slice(14, 17), 17
+
+class Theta(NamedTuple):
+    """What the fit is over, by name; the linear algebra sees one vector, `flat`."""
+
+    impedance: Any
+    """(..., 7) elements of D and K in the middle of the window, in the order of `SYMMETRIC_ELEMENTS`."""
+    kappa: Any
+    """(..., 7) how much each of them changes over the window, as a share of its middle."""
+    inertia: Any
+    """(..., 3) base inertial parameters in Börner's order [kg m^2]."""
+    delay: Any
+    """(...) of the motion after the command [s]."""
+
+    @classmethod
+    def of(cls, flat: Any) -> Theta:
+        """From a vector (..., 18)."""
+        return cls(flat[..., :7], flat[..., 7:14], flat[..., 14:17], flat[..., 17])
+
+    @property
+    def flat(self) -> Numbers:
+        """(18,)"""
+        return np.concatenate([self.impedance, self.kappa, self.inertia, [self.delay]])
+
+
+PLACES = Theta.of(np.arange(18))
+"""Where each parameter stands in the vector."""
+VARYING = np.concatenate([PLACES.impedance, PLACES.kappa])
+"""Of a trial's own, around the mean of all trials."""
+
+
+def _matrices(impedance: Any) -> tuple[Any, Any]:
+    """D and K (..., 2, 2) of their elements (..., 7)."""
+    return impedance[..., :4].reshape(*impedance.shape[:-1], 2, 2), symmetric_matrix(impedance[..., 4:])
 
 
 class OutputErrorFit(eqx.Module):
@@ -118,13 +152,13 @@ class OutputErrorFit(eqx.Module):
     K: Float[Any, "*G 2 2"]
     """Stiffness there [N m/rad]."""
     kappa: Float[Any, "*G 7"]
-    """How much D11, D12, D21, D22, K11, K12, K22 change over the window, as a share of their middle."""
+    """How much the elements of D and K (`SYMMETRIC_ELEMENTS`) change over the window, as a share of their middle."""
     inertia: Float[Any, "*G 3"]
-    """Base inertial parameters of eq. (12) of Börner et al. 2020, given and improved [kg m^2]."""
+    """Base inertial parameters in Börner's order, given and improved [kg m^2]."""
     delay: Float[Any, "*G"]
     """Of the motion after the command [s]."""
     covariance: Float[Any, "*G 18 18"]
-    """Of D11, D12, D21, D22, K11, K12, K22, kappa, inertia and delay, in this order."""
+    """Of the elements of D and K (`SYMMETRIC_ELEMENTS`), kappa, inertia and delay, as they stand in `Theta`."""
     dof: Float[Any, "*G 18"]
     """Degrees of freedom for Student's t: how well the unperturbed trials tell the variance."""
     chi2: Float[Any, "*G"]
@@ -152,17 +186,15 @@ class OutputErrorFit(eqx.Module):
         the mean impedance of the group's trials."""
         from scipy.stats import t as student
 
-        half = student.ppf(0.5 + level / 2, self.dof) * self.stderr
-        shape = (*half.shape[:-1], 2, 2)
-        return half[..., :4].reshape(shape), half[..., 4:7][..., PAIRS].reshape(shape)
+        return _matrices(Theta.of(student.ppf(0.5 + level / 2, self.dof) * self.stderr).impedance)
 
 
 def output_error(
-    perturbed: Movements,
-    unperturbed: Movements,
+    perturbed: Trials,
+    unperturbed: Trials,
     geometry: ArmGeometry,
     handle: Handle,
-    inertia: Num[AnyArray, "3"],
+    inertia: BaseInertia | Num[AnyArray, "3"],
     inertia_stderr: Num[AnyArray, "3"] | None = None,
     *,
     window: float = VOLUNTARY_DELAY,
@@ -173,8 +205,9 @@ def output_error(
 
     **Arguments:** `perturbed` and `unperturbed` are different trials of one task, aligned at their onsets, where the
     hand crosses one line; a line across its mean velocity is taken. Used of them are position, velocity and
-    acceleration in the window, position before it, and the command. `inertia` (3,) base parameters of eq. (12) of
-    Börner et al. 2020 [kg m^2], as the static task gives them, and their standard errors (by default `USUAL_STDERR`);
+    acceleration in the window, position before it, and the command. `inertia`, a `BaseInertia`, or three base
+    parameters **in Börner's order** (eq. (12)) [kg m^2], as the static task gives them, and their standard errors in
+    the same order (by default `USUAL_STDERR`);
     `window` [s] in which nothing voluntary happens; `sensor_noise` standard deviation of a sample of the position [m];
     `groups` (G, m) indices of perturbed trials, each group with an estimate of its own; without, all trials are one.
 
@@ -207,25 +240,56 @@ def output_error(
         linear = _Linear.of(theta, target, lanes, geometry, handle, prior)
         step = linear.solve(np.arange(len(perturbed)), known)
         theta = known.within(step.theta)
-        rest = bool((np.abs(theta - linear.theta)[:7] < SMALL_STEP * np.sqrt(np.diag(step.covariance))[:7]).all())
+        moved, stderr = np.abs(theta - linear.theta), np.sqrt(np.diag(step.covariance))
+        rest = bool((moved < SMALL_STEP * stderr)[PLACES.impedance].all())
         if rest:
             break
     steps = [linear.solve(members, known) for members in chosen]
     found = _Step(*(np.stack(x) if groups is not None else np.asarray(x[0]) for x in zip(*steps, strict=True)))
-    theta_of, matrix = found.theta, (*found.theta.shape[:-1], 2, 2)
+    of_groups = Theta.of(found.theta)
+    D, K = _matrices(of_groups.impedance)
     return OutputErrorFit(
-        D=theta_of[..., :4].reshape(matrix),
-        K=theta_of[..., 4:7][..., PAIRS].reshape(matrix),
-        kappa=theta_of[..., KAPPA],
-        inertia=theta_of[..., INERTIA],
-        delay=theta_of[..., DELAY],
+        D=D,
+        K=K,
+        kappa=of_groups.kappa,
+        inertia=of_groups.inertia,
+        delay=of_groups.delay,
         covariance=found.covariance,
         dof=found.dof,
         chi2=found.chi2,
-        converged=np.isfinite(theta_of).all(axis=-1) & rest & (np.abs(theta_of[..., DELAY]) < DELAYS),
+        converged=np.isfinite(found.theta).all(axis=-1) & rest & (np.abs(of_groups.delay) < DELAYS),
         residual=linear.r.reshape(len(perturbed), -1, 2),
         deviations=_full_rate(jnp.asarray(theta), lanes, geometry, handle, perturbed),
     )
+
+
+def learned_continuation(
+    perturbed: Trials,
+    unperturbed: Trials | None,
+    arm: KnownArm,
+    window: float = VOLUNTARY_DELAY,
+    groups: Integer[AnyArray, "G m"] | None = None,
+) -> Isolated:
+    """The unperturbed movement is how unperturbed trials teach that this one goes on, the deviation is simulated, and
+    the impedance is that for which both meet the measured movement: `output_error`.
+
+    **Arguments:** `groups` (G, m) indices of the perturbed trials of each estimate; without it, one of all of them.
+
+    **Raises:** `ValueError` without unperturbed trials, and as `output_error`.
+    """
+    if unperturbed is None:
+        raise ValueError(
+            "output error learns from unperturbed trials how the movement goes on, and there are none: record some "
+            "(30 or more), or use gomi_kawato"
+        )
+    fit = output_error(
+        perturbed, unperturbed, arm.geometry, known_handle(arm), arm.inertia, arm.inertia_stderr,
+        window=window, groups=groups,
+    )  # fmt: skip
+    at = PLACES.impedance
+    of_both, dof = fit.covariance[..., at[:, None], at], fit.dof[..., at].min(axis=-1)
+    found = (fit.D, fit.K, of_both, fit.inertia, dof, fit.chi2, fit.converged, fit.delay, fit.kappa[..., 4:])
+    return Isolated(fit.deviations, impedance=Impedance(*map(jnp.asarray, found)))
 
 
 # How a movement goes on.
@@ -270,7 +334,7 @@ class Continuation(NamedTuple):
 
 
 def learn_continuation(
-    unperturbed: Movements, perturbed: Movements, window: float = VOLUNTARY_DELAY, noise: float = 0.0
+    unperturbed: Trials, perturbed: Trials, window: float = VOLUNTARY_DELAY, noise: float = 0.0
 ) -> Continuation:
     """How a movement goes on after its onset, from unperturbed trials and from what precedes the perturbation.
 
@@ -304,13 +368,13 @@ def learn_continuation(
     return Continuation(mean[:a], mean[a:], B, R, np.linalg.cholesky(Sigma))
 
 
-def _realigned(unperturbed: Movements, perturbed: Movements, bins: _Bins) -> tuple[list[Numbers], list[Numbers]]:
+def _realigned(unperturbed: Trials, perturbed: Trials, bins: _Bins) -> tuple[list[Numbers], list[Numbers]]:
     """Windows of the same kind at other places of the movement: lists of (n, a + b) and of (T, a + b)."""
     rate, first = unperturbed.sample_rate, np.asarray(unperturbed.onset)
     along = np.asarray(unperturbed.velocity)[np.arange(len(first)), first].mean(axis=0)
     along = along / np.linalg.norm(along)
 
-    def at_lines(movements: Movements, shift: int, offsets: tuple[float, ...], last: int) -> list[Numbers]:
+    def at_lines(movements: Trials, shift: int, offsets: tuple[float, ...], last: int) -> list[Numbers]:
         """Of the offsets that leave room within every trial, of which samples count up to `onset + last`."""
         distance, onset = np.asarray(movements.position) @ along, np.asarray(movements.onset)
         found = []
@@ -331,7 +395,7 @@ def _realigned(unperturbed: Movements, perturbed: Movements, bins: _Bins) -> tup
     return at_lines(unperturbed, 0, REALIGNED, everything), at_lines(perturbed, -after, REALIGNED_BEFORE, 0)
 
 
-def _binned(movements: Movements, first: int, last: int, bins: _Bins, onset: np.ndarray | None = None) -> Numbers:
+def _binned(movements: Trials, first: int, last: int, bins: _Bins, onset: np.ndarray | None = None) -> Numbers:
     """(T, last - first, 2) mean positions; the bin 0 begins one sample after the onset."""
     onset = np.asarray(movements.onset) if onset is None else onset
     samples = onset[:, None] + 1 + np.arange(first * bins.width, last * bins.width)
@@ -367,7 +431,7 @@ class _Lanes(eqx.Module):
     """Samples in a bin."""
 
 
-def _in_lanes(perturbed: Movements, geometry: ArmGeometry, handle: Handle, bins: _Bins) -> _Lanes:
+def _in_lanes(perturbed: Trials, geometry: ArmGeometry, handle: Handle, bins: _Bins) -> _Lanes:
     rate, onset = perturbed.sample_rate, np.asarray(perturbed.onset)
     finer = int(np.ceil(1 / (rate * STEP) - 1e-9))
     room = int(np.ceil((DELAYS + 0.001) * rate - 1e-9))
@@ -408,16 +472,16 @@ def _delayed(command: Array, samples: int, delay: Array) -> Array:
 
 
 def _deviation(
-    theta: Float[Array, "18"], lanes: _Lanes, geometry: ArmGeometry, handle: Handle
+    flat: Float[Array, "18"], lanes: _Lanes, geometry: ArmGeometry, handle: Handle
 ) -> tuple[Array, Array, Array]:
     """(S, 2, T) deviations of the joints' angles [rad], their velocities and accelerations; zero at the onset."""
-    samples, h = len(lanes.q), 1 / lanes.rate
-    xi, carried = lakatos_from_borner(theta[INERTIA]), handle.mass + handle.own_mass
-    pushed = geometry.joint_torque(_last(lanes.q), _last(_delayed(lanes.command, samples, theta[DELAY] * lanes.rate)))
+    samples, h, theta = len(lanes.q), 1 / lanes.rate, Theta.of(flat)
+    xi, carried = lakatos_from_borner(theta.inertia), handle.mass + handle.own_mass
+    pushed = geometry.joint_torque(_last(lanes.q), _last(_delayed(lanes.command, samples, theta.delay * lanes.rate)))
     body = rigid_body_torque(_last(lanes.q), _last(lanes.dq), _last(lanes.ddq), xi)
     drive = jnp.moveaxis(body - pushed, -1, 1) + lanes.carried
-    course = 1 + jnp.outer(jnp.arange(samples) / (samples - 1) - 0.5, theta[KAPPA])
-    impedance = course * theta[:7]
+    course = 1 + jnp.outer(jnp.arange(samples) / (samples - 1) - 0.5, theta.kappa)
+    impedance = course * theta.impedance
 
     def acceleration(away: Array, slip: Array, at: tuple[Array, ...]) -> Array:
         q, dq, ddq, drive, p = at
@@ -471,7 +535,7 @@ def _linearised(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Hand
 
 
 @eqx.filter_jit
-def _full_rate(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Movements) -> Deviations:
+def _full_rate(theta: Array, lanes: _Lanes, geometry: ArmGeometry, handle: Handle, perturbed: Trials) -> Deviations:
     """At the rate of the measurement."""
     change = _deviation(theta, lanes, geometry, handle)
     measured = [_last(x[:: lanes.finer]) for x in (lanes.q, lanes.dq, lanes.ddq)]
@@ -492,13 +556,13 @@ class _Known(NamedTuple):
     """What is known before."""
 
     start: Numbers
-    """theta_0"""
+    """(18,) theta_0"""
     P: Numbers
     """Inverse of its covariance; none of D, K and the delay."""
 
     @classmethod
-    def of(cls, inertia: AnyArray, stderr: AnyArray | None) -> _Known:
-        pi = np.asarray(inertia, float)
+    def of(cls, inertia: BaseInertia | AnyArray, stderr: AnyArray | None) -> _Known:
+        pi = np.asarray(inertia.borner if isinstance(inertia, BaseInertia) else inertia, float)
         sd = np.multiply(USUAL_STDERR, pi) if stderr is None else np.asarray(stderr, float)
         for name, x in (("inertia", pi), ("inertia_stderr", sd)):
             if x.shape != (3,) or not (np.isfinite(x) & (x > 0)).all():
@@ -506,20 +570,19 @@ class _Known(NamedTuple):
                     f"{name} is {np.array2string(x)}: it must be three finite numbers above zero [kg m^2], the base "
                     "parameters I_1 + m_2 l1^2, I_2, m_2 c_2 l1"
                 )
-        element = np.concatenate([PAIRS, [0, 1, 2]])
+        element = np.array([0, 1, 1, 2, 0, 1, 2])  # of D and of K, which of 11, 12 and 22
         common, pair, own = TREND
         trend = common**2 + pair**2 * (element[:, None] == element) + own**2 * np.eye(7)
-        P = np.zeros((18, 18))
-        P[KAPPA, KAPPA], P[INERTIA, INERTIA] = np.linalg.inv(trend), np.diag(sd**-2.0)
-        return cls(np.concatenate([START, np.zeros(7), pi, [0.0]]), P)
+        P, kappa, at = np.zeros((18, 18)), PLACES.kappa, PLACES.inertia
+        P[np.ix_(kappa, kappa)], P[at, at] = np.linalg.inv(trend), sd**-2.0
+        return cls(Theta(START, np.zeros(7), pi, 0.0).flat, P)
 
     def within(self, theta: Numbers) -> Numbers:
         """Where the arm can be simulated: trials that no impedance explains lead the iteration anywhere."""
-        limit = np.full(18, np.inf)
-        limit[:7], limit[KAPPA], limit[DELAY] = 10 * self.start[:7], 2.0, DELAYS
-        low, high = -limit, limit
-        low[INERTIA], high[INERTIA] = self.start[INERTIA] / 2, 2 * self.start[INERTIA]
-        return np.clip(theta, low, high)
+        start, kappa = Theta.of(self.start), np.full(7, 2.0)
+        low = Theta(-10 * start.impedance, -kappa, start.inertia / 2, -DELAYS)
+        high = Theta(10 * start.impedance, kappa, 2 * start.inertia, DELAYS)
+        return np.clip(theta, low.flat, high.flat)
 
 
 class _Step(NamedTuple):
@@ -555,9 +618,10 @@ class _Linear(NamedTuple):
         delta, S = map(np.asarray, _linearised(jnp.asarray(theta), lanes, geometry, handle))
         whiten = np.linalg.inv(prior.weight)
         S, r = whiten @ S, target - delta
-        spread = np.concatenate([SPREAD[0] * np.abs(theta[:7]), np.full(7, SPREAD[1]), np.zeros(4)])
-        A = S[..., :14] * spread[:14]
-        inner = np.eye(14) + A.swapaxes(1, 2) @ A
+        impedance = np.abs(Theta.of(theta).impedance)
+        spread = Theta(SPREAD[0] * impedance, np.full(7, SPREAD[1]), np.zeros(3), 0.0).flat
+        A = (S * spread)[..., VARYING]
+        inner = np.eye(len(VARYING)) + A.swapaxes(1, 2) @ A
         W = np.eye(S.shape[1]) - A @ np.linalg.solve(inner, A.swapaxes(1, 2))
         return cls(theta, r, r @ whiten.T, S, W, spread, prior.residuals @ whiten.T)
 
@@ -614,7 +678,7 @@ def _members(groups: AnyArray | None, trials: int) -> list[np.ndarray]:
     return list(chosen)
 
 
-def _check(perturbed: Movements, unperturbed: Movements, bins: _Bins) -> None:
+def _check(perturbed: Trials, unperturbed: Trials, bins: _Bins) -> None:
     if perturbed.sample_rate != unperturbed.sample_rate:
         raise ValueError(
             f"perturbed trials have {perturbed.sample_rate:g} samples a second and unperturbed ones "
@@ -635,7 +699,7 @@ def _check(perturbed: Movements, unperturbed: Movements, bins: _Bins) -> None:
         )
 
 
-def _check_shapes(name: str, movements: Movements) -> None:
+def _check_shapes(name: str, movements: Trials) -> None:
     shape = np.shape(movements.position)
     others = [np.shape(x) for x in (movements.velocity, movements.acceleration, movements.force, movements.command)]
     if len(shape) != 3 or shape[-1] != 2 or set(others) != {shape} or np.shape(movements.onset) != shape[:1]:
@@ -645,7 +709,7 @@ def _check_shapes(name: str, movements: Movements) -> None:
         )
 
 
-def _check_room(name: str, movements: Movements, bins: _Bins) -> None:
+def _check_room(name: str, movements: Trials, bins: _Bins) -> None:
     onset, rate, N = np.asarray(movements.onset), movements.sample_rate, np.shape(movements.position)[1]
     before, after = -bins.before * bins.width, bins.after * bins.width
     early, late = np.flatnonzero(onset + 1 < before), np.flatnonzero(onset + after >= N)
@@ -667,7 +731,7 @@ def _check_room(name: str, movements: Movements, bins: _Bins) -> None:
             )
 
 
-def _in_use(movements: Movements, bins: _Bins, x: AnyArray) -> np.ndarray:
+def _in_use(movements: Trials, bins: _Bins, x: AnyArray) -> np.ndarray:
     """(T, samples, 2) of a signal, from the history to the end of the window."""
     samples = np.arange(bins.before * bins.width, bins.after * bins.width) + 1
     return np.asarray(x)[np.arange(len(movements))[:, None], np.asarray(movements.onset)[:, None] + samples]

@@ -1,0 +1,145 @@
+"""Run a job with `[trials]`: read the trials, know the arm, and identify its impedance by every method asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximp.jobs.job import Job
+from jaximp.numerics.precision import require_float64
+from jaximp.perturbation.deviations import KnownArm
+from jaximp.perturbation.impedance import ArmImpedance, identify_impedance
+from jaximp.perturbation.isolation.feedback_jerk import energy_spectra
+from jaximp.perturbation.isolation.methods import METHODS
+from jaximp.perturbation.static import StaticFit, static_inertia
+from jaximp.perturbation.trials import Trials
+from jaximp.perturbation.windows import OtherWindows, at_other_windows
+from jaximp.types import Numbers, Progress, nearest
+
+
+@dataclass(frozen=True)
+class TrialsResult:
+    """What a job with `[trials]` gives."""
+
+    estimates: tuple[ArmImpedance, ...]
+    """By every method that was asked for, the main one first."""
+    windows: OtherWindows | None
+    """By the main method, from other windows."""
+    spectra: tuple[Numbers, Numbers, Numbers] | None
+    """Of the jerk, where there are unperturbed trials: `energy_spectra`."""
+    static: StaticFit | None
+    """What `[trials.posture]` tells."""
+    postures: int = 0
+    """Trials of it."""
+    notes: tuple[str, ...] = ()
+    """What reading the trials says."""
+
+    @property
+    def main(self) -> ArmImpedance:
+        return self.estimates[0]
+
+
+def identify_trials(job: Job, progress: Progress = lambda share: None) -> TrialsResult:
+    """Run a job with `[trials]`. It writes no files.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    require_float64()
+    trials = job.trials
+    if trials is None:
+        raise ValueError("this job has no [trials]: identify() is for recordings with windows")
+    check_trials(job)
+    known = _Known(job)
+    progress(0.1)
+    cutoff = None if trials.cutoff is None else np.array(trials.cutoff)
+    read: dict[bool, tuple[Trials, Trials | None, tuple[str, ...]]] = {}
+    estimates: list[ArmImpedance] = []
+    for k, method in enumerate(trials.methods):
+        smooth = METHODS[method].smooth
+        if smooth not in read:
+            read[smooth] = trials.load(smooth)
+        progress(0.1 + 0.6 * (k + 0.5) / len(trials.methods))
+        perturbed, unperturbed, _ = read[smooth]
+        arm = known.arm(METHODS[method].linearised)
+        estimates.append(identify_impedance(perturbed, unperturbed, arm, method, trials.window, cutoff, job.trust))
+        progress(0.1 + 0.6 * (k + 1) / len(trials.methods))
+    main = estimates[0]
+    perturbed, unperturbed, notes = read[METHODS[main.method].smooth]
+    windows = at_other_windows(perturbed, unperturbed, main.arm, main.method, trials.window, cutoff)
+    progress(0.9)
+    spectra = None
+    if unperturbed is not None and True in read and any(one.curves.cutoff is not None for one in estimates):
+        smoothed, free, _ = read[True]
+        assert free is not None
+        spectra = energy_spectra(smoothed, free)
+    progress(1.0)
+    said = tuple(note for note in dict.fromkeys((*notes, *known.notes)) if note not in main.warnings)
+    return TrialsResult(tuple(estimates), windows, spectra, known.static(False), known.postures, said)
+
+
+def check_trials(job: Job) -> None:
+    """**Raises:** `ValueError` for a job whose trials cannot be identified."""
+    trials, arm = job.trials, job.model.arm
+    assert trials is not None
+    assert arm is not None
+    for method in trials.methods:
+        if method not in METHODS:
+            raise ValueError(f"trials.method is '{method}': {nearest(method, list(METHODS))}")
+    if trials.task == "posture":
+        raise ValueError(
+            "a job of postures alone tells the inertia and no impedance in motion: put their file into "
+            "[trials.posture] of the job with the movements"
+        )
+    if arm.known_inertia is None and trials.posture is None:
+        raise ValueError(
+            "the arm's inertia is not known: add [trials.posture] with trials of the static task, or "
+            "model.arm.inertia = { upper_arm = I_1 + m_2 l1^2, forearm = I_2, coupling = m_2 c_2 l1 } in kg m^2"
+        )
+
+
+class _Known:
+    """What a job knows of the arm, read once."""
+
+    def __init__(self, job: Job):
+        assert job.trials is not None
+        assert job.model.arm is not None
+        self._settings, self._handle = job.model.arm, job.trials.known_handle()
+        self._table = job.trials.posture
+        self._found: dict[bool, StaticFit] = {}
+        self.notes: tuple[str, ...] = ()
+        self.postures = 0
+        if self._table is not None:
+            with _in_postures():
+                self._trials, _, notes = self._table.load()
+            self.notes = tuple(f"postures: {note}" for note in notes)
+            self.postures = len(self._trials)
+
+    def static(self, linearised: bool) -> StaticFit | None:
+        """What the postures tell, where there are some."""
+        if self._table is None:
+            return None
+        if linearised not in self._found:
+            geometry = self._settings.geometry()
+            with _in_postures():
+                self._found[linearised] = static_inertia(self._trials, geometry, self._table.window, linearised)
+        return self._found[linearised]
+
+    def arm(self, linearised: bool) -> KnownArm:
+        geometry, static = self._settings.geometry(), self.static(linearised)
+        if static is not None:
+            return KnownArm(geometry, static.inertia, self._handle, static.inertia_stderr)
+        given, stderr = self._settings.known_inertia, self._settings.known_stderr
+        assert given is not None
+        return KnownArm(geometry, given, self._handle, None if stderr is None else stderr.borner)
+
+
+@contextmanager
+def _in_postures() -> Iterator[None]:
+    """Errors say which of the two tables is meant."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"[trials.posture]: {error}") from None
