@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint studies notebooks job-keys lock clean
+.PHONY: setup demo test test-all lint studies notebooks job-keys lock clean
 
 setup: .venv/ready
 
@@ -21,8 +21,17 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Most of the time goes into compiling: here without what takes the compiler long, as `numerics.compilation` does for
+# the estimates anyway, and without what is marked slow.
+LESS := --xla_cpu_use_fusion_emitters=false
+PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+
 test: lint
-	$(BIN)/pytest -n 2 --dist loadfile
+	XLA_FLAGS="$(LESS) $$XLA_FLAGS" $(PYTEST) -m "not slow"
+
+# All tests, compiled as for a user.
+test-all: lint
+	$(PYTEST)
 
 # The slow studies behind the README's tables; their results stand in experiments/results.
 studies: setup

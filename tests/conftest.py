@@ -1,7 +1,12 @@
-"""Float64, enforced shapes, and where the real recordings are."""
+"""Float64, enforced shapes, little memory, one store of compiled programs, and where the real recordings are."""
 
+import ctypes
+import gc
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -12,18 +17,39 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_enable_x64", True)
 install_import_hook("jaximp", "shapes.checked")
 
-
+STORE = pytest.StashKey[Path]()
+MUCH_MEMORY = 1_500_000_000
+"""Of one process [bytes]: compilers leave it full of holes, which are given back from here on."""
 MANY_MAPS = 20_000
 """Pieces of memory of one process. Every compiled program takes some, and at 65 530 Linux gives no more: XLA aborts."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_compiled_programs() -> Iterator[None]:
-    """A worker compiles for hundreds of tests: what it has compiled is dropped before there is too much of it."""
+def pytest_configure(config: pytest.Config) -> None:
+    """What takes long to compile is compiled once: for all workers, and for all processes that tests start."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        config.stash[STORE] = Path(tempfile.mkdtemp(prefix="jaximp-tests-"))
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.stash[STORE])
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"] or None)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if STORE in config.stash:
+        shutil.rmtree(config.stash[STORE], ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def little_memory() -> Iterator[None]:
+    """A worker compiles for hundreds of tests. Linux only; elsewhere nothing is given back."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
-        jax.clear_caches()
+    memory, maps = Path("/proc/self/statm"), Path("/proc/self/maps")
+    if memory.exists() and int(memory.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MUCH_MEMORY:
+        if maps.read_bytes().count(b"\n") > MANY_MAPS:
+            jax.clear_caches()
+            gc.collect()
+        with suppress(AttributeError):  # some C libraries have no such function
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

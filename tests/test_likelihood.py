@@ -76,6 +76,34 @@ def arm_density(**prior: Any) -> Density:
     return stiffness_density(residual_triangle(*pulses()), 300, make_prior((*STIFFNESS, "log_noise"), prior))
 
 
+# Compiled once for all densities that are made alike.
+
+
+@eqx.filter_jit
+def value(density: Density, theta: Any) -> Any:
+    return density(theta)
+
+
+@eqx.filter_jit
+def gradient(density: Density, theta: Any) -> Any:
+    return jax.grad(density)(theta)
+
+
+@eqx.filter_jit
+def elements(density: Density, theta: Any) -> Any:
+    return density.elements(theta)
+
+
+@eqx.filter_jit
+def jacobian(density: Density, theta: Any) -> Any:
+    return jax.jacobian(density.elements)(theta)
+
+
+@eqx.filter_jit
+def curvature(density: Density, theta: Any) -> Any:
+    return -jax.hessian(density.likelihood.log_likelihood)(theta)
+
+
 # Noise
 
 
@@ -108,7 +136,7 @@ def test_density_of_coloured_noise_is_the_multivariate_normal_distribution() -> 
         return float(multivariate_normal.logpdf(y, W @ theta[:3], np.exp(2 * theta[3]) * C))
 
     points = np.r_[THETA, -1.0] * np.array([[1, 1, 1, 1], [1.1, 0.9, 1, 0.5], [0.5, 1, 1.2, -0.3]])
-    ours = jax.vmap(density)(jnp.asarray(points))
+    ours = jax.jit(jax.vmap(density))(jnp.asarray(points))
     theirs = np.array([expected(point) for point in points])
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-5)
 
@@ -254,7 +282,7 @@ def test_gaussian_density_needs_no_rows_and_is_students_t() -> None:
     assert density.units == (*UNITS, "ln(N m)")
     assert density.likelihood.rows.shape == (1, 4, 4)
     theta = jnp.asarray([*(THETA * 1.02), -1.1])
-    np.testing.assert_allclose(density(theta), norm.logpdf(y, W @ np.asarray(theta[:3]), np.exp(-1.1)).sum())
+    np.testing.assert_allclose(value(density, theta), norm.logpdf(y, W @ np.asarray(theta[:3]), np.exp(-1.1)).sum())
 
     # integrated over the logarithm of the noise
     best = np.linalg.lstsq(W, y)[0]
@@ -263,7 +291,8 @@ def test_gaussian_density_needs_no_rows_and_is_students_t() -> None:
         best + np.sqrt(np.diag(scale)) * np.array([[0, 0, 0], [1, -1, 2], [3, 1, 0.0]]),
         np.linspace(-3, 1, 4001),
     )
-    values = jax.vmap(lambda x: jax.vmap(lambda s: density(jnp.append(x, s)))(jnp.asarray(grid)))(jnp.asarray(points))
+    over_noise = jax.vmap(lambda x, s: density(jnp.append(x, s)), (None, 0))
+    values = jax.jit(jax.vmap(over_noise, (0, None)))(points, grid)
     marginal = jax.scipy.special.logsumexp(values, axis=1)
     expected = multivariate_t.logpdf(points, best, scale, 57)
     np.testing.assert_allclose(np.diff(marginal), np.diff(expected), rtol=1e-8)
@@ -283,11 +312,11 @@ def test_two_outputs_have_their_own_noise() -> None:
     density = linear_density(arm.names, arm.units, whiten(W, y))
     assert density.names[-2:] == ("log_noise_1", "log_noise_2")
     at = jnp.append(jnp.asarray(theta), jnp.log(jnp.array([0.1, 3.0])))
-    np.testing.assert_allclose(density(at), norm.logpdf(y, W @ theta, [0.1, 3.0]).sum())
+    np.testing.assert_allclose(value(density, at), norm.logpdf(y, W @ theta, [0.1, 3.0]).sum())
     mode, covariance = density.laplace()
     np.testing.assert_allclose(jnp.exp(mode[-2:]), [0.1, 3.0], rtol=0.15)
     assert (np.abs(mode[:11] - theta) < 5 * np.sqrt(np.diag(covariance)[:11])).all()
-    np.testing.assert_allclose(jax.grad(density)(mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
+    np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
 
 
 def test_heavy_tails_shrug_off_outliers() -> None:
@@ -298,13 +327,15 @@ def test_heavy_tails_shrug_off_outliers() -> None:
     at = np.r_[THETA, -1.0]
     kept = np.arange(200) != 7
     expected = student.logpdf(y - W @ THETA, 4, scale=np.exp(-1.0))[kept].sum()
-    np.testing.assert_allclose(density(at), expected)
+    np.testing.assert_allclose(value(density, at), expected)
     mode, covariance = density.laplace()
     z = (np.asarray(mode[:3]) - THETA) / np.sqrt(np.diag(covariance)[:3])
     assert np.abs(z).max() < 4
     gaussian = linear_density(NAMES, UNITS, rows).laplace()[0]
     assert abs(gaussian[2] - 20) > 3 * abs(mode[2] - 20)
-    found = minimize(lambda x: -float(density(x)), np.asarray(mode), method="Nelder-Mead", options={"xatol": 1e-7})
+    found = minimize(
+        lambda x: -float(value(density, x)), np.asarray(mode), method="Nelder-Mead", options={"xatol": 1e-7}
+    )
     np.testing.assert_allclose(mode, found.x, rtol=1e-4)
 
 
@@ -314,7 +345,7 @@ def test_long_records_are_whitened_piece_by_piece(monkeypatch: pytest.MonkeyPatc
     n, valid = len(y), np.ones(len(y), bool)
     valid[n // 2 : n // 2 + 40] = False
     pieces = whiten(W, y, r, valid)
-    monkeypatch.setattr("jaximp.least_squares.noise.PIECE", 10**6)
+    monkeypatch.setattr(importlib.import_module("jaximp.least_squares.noise"), "PIECE", 10**6)
     whole = whiten(W, y, r, valid)
     assert np.abs(pieces.W - whole.W).max() > 0
     left, same = (residuals(rows, optimum(rows)) for rows in (pieces, whole))
@@ -330,7 +361,7 @@ def test_trials_together_are_one_record() -> None:
     parts = [whiten(W[k : k + 30], y[k : k + 30]) for k in (0, 30, 60)]
     at = jnp.asarray([*THETA, -1.0])
     whole = linear_density(NAMES, UNITS, whiten(W, y))
-    np.testing.assert_allclose(linear_density(NAMES, UNITS, joined(parts))(at), whole(at))
+    np.testing.assert_allclose(value(linear_density(NAMES, UNITS, joined(parts)), at), value(whole, at))
 
 
 def test_many_windows_are_windows_one_by_one() -> None:
@@ -349,15 +380,20 @@ def test_many_windows_are_windows_one_by_one() -> None:
     modes, covariances = eqx.filter_jit(eqx.filter_vmap(lambda density: density.laplace()))(densities)
     heavy, _ = window_densities(NAMES, UNITS, parts, heavy_tails=5.0)
 
+    @eqx.filter_jit
     def values(of: Any) -> Any:
         return eqx.filter_vmap(lambda density: density(at))(of)
 
+    each, each_heavy = values(densities), values(heavy)
+
     for k, rows in enumerate(part for part, why in zip(parts, reasons, strict=True) if not why):
         alone = linear_density(NAMES, UNITS, rows)
-        np.testing.assert_allclose(values(densities)[k], alone(at), rtol=1e-9)
+        np.testing.assert_allclose(each[k], value(alone, at), rtol=1e-9)
         np.testing.assert_allclose(modes[k], alone.laplace()[0], rtol=1e-6)
         np.testing.assert_allclose(covariances[k], alone.laplace()[1], rtol=1e-5, atol=1e-12)
-        np.testing.assert_allclose(values(heavy)[k], linear_density(NAMES, UNITS, rows, heavy_tails=5.0)(at), rtol=1e-9)
+        np.testing.assert_allclose(
+            each_heavy[k], value(linear_density(NAMES, UNITS, rows, heavy_tails=5.0), at), rtol=1e-9
+        )
 
 
 def test_stiffness_density_is_flat_in_the_stiffness() -> None:
@@ -367,17 +403,17 @@ def test_stiffness_density_is_flat_in_the_stiffness() -> None:
     D, K = np.asarray(theta[:4]).reshape(2, 2), np.array([[5.3, 0], [2.6, 3.1]])
     residual = torque - velocity @ D.T - displacement @ (K @ K.T)
     likelihood = norm.logpdf(residual, 0, np.exp(-2.2)).sum()
-    _, jacobian = np.linalg.slogdet(jax.jacobian(density.elements)(theta))
-    np.testing.assert_allclose(density(theta), likelihood + jacobian)
-    assert density(theta.at[4].set(-5.3)) == density(theta.at[6].set(0.0)) == -jnp.inf
-    assert np.isfinite(jax.grad(density)(theta.at[6].set(-1.0))).all()
+    _, volume = np.linalg.slogdet(jacobian(density, theta))
+    np.testing.assert_allclose(value(density, theta), likelihood + volume)
+    assert value(density, theta.at[4].set(-5.3)) == value(density, theta.at[6].set(0.0)) == -jnp.inf
+    assert np.isfinite(gradient(density, theta.at[6].set(-1.0))).all()
     damping, stiffness = stiffness_matrices(density.elements(theta[None]))
     np.testing.assert_allclose([damping[0], stiffness[0]], [D, K @ K.T])
 
     fit = fit_triangles(residual_triangle(displacement, velocity, torque)[None], 300)
     mode, covariance = density.laplace()
-    np.testing.assert_allclose(density.elements(mode)[:7], fit.theta, rtol=0.01)
-    np.testing.assert_allclose(jax.grad(density)(mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
+    np.testing.assert_allclose(elements(density, mode)[:7], fit.theta, rtol=0.01)
+    np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
 
 
 def test_a_mode_is_found_where_the_data_ask_for_an_indefinite_stiffness() -> None:
@@ -388,7 +424,7 @@ def test_a_mode_is_found_where_the_data_ask_for_an_indefinite_stiffness() -> Non
     mode, covariance = density.laplace()
     assert np.isfinite(covariance).all()
     assert mode[6] > 0
-    np.testing.assert_allclose(jax.grad(density)(mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
+    np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
 
 
 def test_adjusted_curvature_is_the_covariance_of_trials() -> None:
@@ -402,13 +438,13 @@ def test_adjusted_curvature_is_the_covariance_of_trials() -> None:
     plain = stiffness_density(merge_triangles(triangles), 300)
     density = adjusted(plain, fit.covariance)
     mode, _ = plain.laplace()
-    x = plain.elements(mode)
-    H = -np.asarray(jax.hessian(density.likelihood.log_likelihood)(density.likelihood.mode))
+    x = elements(plain, mode)
+    H = np.asarray(curvature(density, density.likelihood.mode))
     np.testing.assert_allclose(np.linalg.inv(H)[:7, :7], fit.covariance, rtol=1e-6, atol=1e-9)
-    ratio = np.diag(np.linalg.inv(H)) / np.diag(np.linalg.inv(-jax.hessian(plain.likelihood.log_likelihood)(x)))
+    ratio = np.diag(np.linalg.inv(H)) / np.diag(np.linalg.inv(curvature(plain, x)))
     assert ratio[4] > 4  # standard errors of independent residuals are less than half of what they are
     np.testing.assert_allclose(ratio[7], 1, rtol=0.05)
-    assert density(mode.at[4].set(-1.0)) == -jnp.inf
+    assert value(density, mode.at[4].set(-1.0)) == -jnp.inf
     with pytest.raises(ValueError, match="fewer than 5"):
         adjusted(plain, fit_triangles(triangles[:4], 25).covariance)
 
@@ -421,10 +457,10 @@ def test_an_estimate_is_students_t_with_a_definite_stiffness() -> None:
     density = estimate_density(STIFFNESS, ("",) * 7, theta, covariance, 9.0)
     assert density.names == (*STIFFNESS[:4], "l11", "l21", "l22")
     at = jnp.asarray([2, 1, 1, 1, 5.0, 2.5, 3.0])
-    _, jacobian = np.linalg.slogdet(jax.jacobian(density.elements)(at))
-    expected = multivariate_t.logpdf(np.asarray(density.elements(at)), theta, covariance, 9)
-    np.testing.assert_allclose(density(at), expected + jacobian)
-    assert density(at.at[6].set(-3.0)) == -jnp.inf
+    _, volume = np.linalg.slogdet(jacobian(density, at))
+    expected = multivariate_t.logpdf(np.asarray(elements(density, at)), theta, covariance, 9)
+    np.testing.assert_allclose(value(density, at), expected + volume)
+    assert value(density, at.at[6].set(-3.0)) == -jnp.inf
     plain = estimate_density(NAMES, UNITS, THETA, np.diag([1e-6, 1e-4, 1e-2]), 9.0)
     np.testing.assert_allclose(
         plain(THETA * 1.01), multivariate_t.logpdf(THETA * 1.01, THETA, np.diag([1e-6, 1e-4, 1e-2]), 9)
@@ -507,11 +543,11 @@ def test_a_log_normal_prior_keeps_a_parameter_positive() -> None:
     W, y = record()
     prior = make_prior((*NAMES, "log_noise"), {"stiffness": LogNormal(5.0, 2.0)})
     density = linear_density(NAMES, UNITS, whiten(W, -y), prior)
-    assert density(jnp.asarray([0.1, 1.0, -1.0, 0.0])) == -jnp.inf
+    assert value(density, jnp.asarray([0.1, 1.0, -1.0, 0.0])) == -jnp.inf
     mode, covariance = density.laplace()
     assert mode[2] > 0
     assert np.isfinite(covariance).all()
-    np.testing.assert_allclose(jax.grad(density)(mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
+    np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
     assert float(arm_density(stiffness_11=Normal(10.0, 0.1)).laplace()[0][4] ** 2) < 20
 
 

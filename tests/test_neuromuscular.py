@@ -43,7 +43,7 @@ def quiet() -> Reaches:
 
 @pytest.mark.parametrize("arm", [ARM, subject(3)], ids=["paper", "another build"])
 def test_without_noise_and_perturbation_the_arm_moves_as_planned(arm: NeuromuscularArm) -> None:
-    moved = simulate(arm, TASK, PUSHES[:1], QUIET[:1]).movements
+    moved = simulate(arm, TASK, PUSHES, QUIET).movements  # the first is not pushed
     x, v, _ = TASK(np.arange(SAMPLES) / RATE)
     np.testing.assert_allclose(moved.position[0], x, atol=1e-6)
     np.testing.assert_allclose(moved.velocity[0], v, atol=1e-5)

@@ -13,6 +13,7 @@ from jaximp.perturbation.trials import in_window
 from jaximp.simulation.neuromuscular import NeuromuscularArm
 
 
+@pytest.mark.slow
 def test_tout2023_is_reproduced(tmp_path: Path) -> None:
     tout2023.reproduce(tmp_path)
     figures = {path.stem for path in tmp_path.glob("*.png")}
@@ -57,6 +58,7 @@ def test_convergence_time(values: list[float], settled: float, expected: float |
     assert found == expected
 
 
+@pytest.mark.slow
 def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A part of what is swept: the same code, fewer cases."""
     for name, values in {
@@ -93,6 +95,7 @@ def test_thresholds_hold_for_all_longer_observations(monkeypatch: pytest.MonkeyP
     np.testing.assert_allclose(lakatos2011.thresholds(kept), [0.37, 0.27, np.inf, 0.17])
 
 
+@pytest.mark.slow
 def test_borner2020_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two simulations in place of ten, and few of the configurations."""
     for name, values in {

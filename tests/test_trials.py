@@ -38,6 +38,7 @@ TRUTH = np.concatenate([QUIET.inertia, np.ravel(QUIET.damping), np.ravel(QUIET.s
 
 
 FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0)
+fit_compiled = jax.jit(fit_trials)
 
 
 def recordings(trials: HeldTrials) -> list[Recording]:
@@ -69,8 +70,12 @@ def logged(held: HeldTrials) -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def fitted(held: HeldTrials) -> WindowFit:
-    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
-    return fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
+    return fit_compiled(rows_of(held.position, held.force), 0.27)
+
+
+@jax.jit
+def rows_of(position: Any, force: Any) -> Any:
+    return regress_trials(ARM, joint_trials(QUIET.geometry, position, force, 150, RATE), FILTER)
 
 
 def test_the_robot_feels_what_the_arm_is() -> None:
@@ -127,8 +132,7 @@ def test_standard_errors_are_not_too_small(position_noise: float, least: float) 
 
     def one(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         noisy = hold(arm, DIRECTIONS, 0.2, TIME, key)
-        trials = joint_trials(QUIET.geometry, noisy.position, noisy.force, 150, RATE)
-        fit = fit_trials(regress_trials(ARM, trials, FILTER), 0.27)
+        fit = fit_trials(rows_of(noisy.position, noisy.force), 0.27)
         return fit.theta, fit.stderr
 
     theta, stderr = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=8))(jax.random.split(jax.random.key(1), 150))
@@ -150,7 +154,7 @@ def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Record
     trials = at_joints(read, before=0.15, after=0.4)
     assert trials.onset == 150
     np.testing.assert_array_equal(rows.W, regress_trials(ARM, trials, FILTER).W)
-    again = fit_trials(rows, 0.27)
+    again = fit_compiled(rows, 0.27)
     np.testing.assert_allclose(again.theta, fitted.theta, rtol=2e-3)  # the end of the trial is elsewhere
     given = at_joints(read, onset=0.15, before=0.15, after=0.4)
     np.testing.assert_array_equal(given.angles, trials.angles)
@@ -163,9 +167,8 @@ def at_joints(recordings: list[Recording], **options: Any) -> JointTrials:
 
 
 def test_unseen_trials_are_predicted(held: HeldTrials) -> None:
-    trials = joint_trials(QUIET.geometry, held.position, held.force, 150, RATE)
-    rows, held_out = regress_trials(ARM, trials, FILTER), np.arange(6) == 5
-    fit = fit_trials(rows, 0.27, ~held_out)
+    rows, held_out = rows_of(held.position, held.force), np.arange(6) == 5
+    fit = fit_compiled(rows, 0.27, ~held_out)
     predicted, vaf = predict_trials(rows, fit.theta, 0.27, held_out)
     inside = (np.asarray(rows.time) > -1e-3) & (np.asarray(rows.time) < 0.271)
     seen, unseen = np.asarray(rows.torque)[5, inside], np.asarray(predicted)[5, inside]
@@ -350,14 +353,10 @@ def test_wrong_use_is_refused(held: HeldTrials, call: Any, message: str) -> None
         call(held.position, held.force)
 
 
-def rows_of(position: Any, force: Any) -> Any:
-    return regress_trials(ARM, joint_trials(QUIET.geometry, position, force, 150, RATE), FILTER)
-
-
 def test_observations_are_a_batch(held: HeldTrials) -> None:
     rows = rows_of(held.position, held.force)
     together = jax.jit(jax.vmap(lambda observed: fit_trials(rows, observed).theta))(jnp.array([0.2, 0.27]))
-    np.testing.assert_allclose(together[1], fit_trials(rows, 0.27).theta, rtol=1e-9)
+    np.testing.assert_allclose(together[1], fit_compiled(rows, 0.27).theta, rtol=1e-9)
 
 
 def test_the_shoulder_may_be_anywhere(held: HeldTrials, fitted: WindowFit) -> None:
