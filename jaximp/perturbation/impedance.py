@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from jaximp.jobs.job import Job
 from jaximp.jobs.trials import TrialsSettings
 from jaximp.least_squares.window import confidence_interval
+from jaximp.models.endpoint import EndpointImpedance, endpoint_impedance
 from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.isolation import (
     METHODS,
@@ -173,6 +174,11 @@ class ArmImpedance:
     def improved(self) -> KnownArm:
         """What was known, with the inertia as a method improved it."""
         return self.arm if self.own is None else self.arm.with_inertia(self.own.inertia)
+
+    @property
+    def at_hand(self) -> EndpointImpedance:
+        """What is felt at the hand, where it was at the onset."""
+        return endpoint_impedance(self.arm.geometry, self.angles, self.improved.xi, self.D, self.K)
 
     @property
     def inertia_stderr(self) -> Numbers | None:
