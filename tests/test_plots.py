@@ -93,12 +93,12 @@ FIGURES = {
     "methods": lambda estimates: plots.methods([replace(estimates, method=1), replace(estimates, method=3)]),
 }
 UNITS = {
-    "parameters": ("[kg m²]", "[N m s/rad]", "[N m/rad]", "[N m]", "end of the window [s]"),
-    "condition": ("[1]", "end of the window [s]"),
-    "torque": ("torque [N m]", "residual [N m]", "time [s]"),
-    "spectrum": ("[(N m)²/Hz]", "frequency [Hz]"),
-    "window_lengths": ("stiffness [N m/rad]", "window length [s]", "[1]"),
-    "methods": ("stiffness [N m/rad]", "end of the window [s]"),
+    "parameters": ("(kg m²)", "(N m s/rad)", "(N m/rad)", "(N m)", "middle of the window (s)"),
+    "condition": ("(1)", "middle of the window (s)"),
+    "torque": ("torque (N m)", "residual (N m)", "time (s)"),
+    "spectrum": ("[(N m)²/Hz]", "frequency (Hz)"),
+    "window_lengths": ("stiffness (N m/rad)", "window length (s)", "(1)"),
+    "methods": ("stiffness (N m/rad)", "middle of the window (s)"),
 }
 
 
@@ -183,7 +183,7 @@ def test_ellipses_stand_at_the_hand_with_scale_bars() -> None:
         geometry, q, {"one": unknown, "two": endpoint_impedance(geometry, q, xi, D, 1.3 * K)}, truth
     )
     assert plots.png(figure).startswith(b"\x89PNG")
-    for label in ("inertia", "damping", "stiffness", " kg", " N s/m", " N/m", "x [m]", "y [m]", "truth", "two"):
+    for label in ("inertia", "damping", "stiffness", " kg", " N s/m", " N/m", "x (m)", "y (m)", "truth", "two"):
         assert label in words_on(figure)
     middles = [np.mean(line.get_xydata()[:-1], axis=0) for panel in figure.axes for line in panel.get_lines()[1:4]]
     known = [middle for middle in middles if np.isfinite(middle).all()]

@@ -7,14 +7,11 @@ What is shown may come from anywhere (file names, subjects, reasons): it travels
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -24,7 +21,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from jaximp import plots
-from jaximp.reports.pages import template, versions, without_nan
+from jaximp.reports.pages import embedded, part, policy, style_source, template, versions, without_nan
 from jaximp.trust.verdicts import TRUSTED, VERDICTS
 from jaximp.types import AnyArray, Numbers
 
@@ -116,13 +113,13 @@ def write_overview(
         "parameter": None if parameter is None else {"name": parameter, "unit": plots.pretty_unit(unit)},
         "series": drawn,
     }
-    script, style = _part("overview.js"), _part("style.jinja") + _part("overview.css")
+    script, style = part("overview.js"), part("style.css") + part("overview.css")
     page = template("overview.jinja").render(
         title=title,
         counts=Counter(recordings.column("status").to_pylist()),
         failures=_failures(recordings),
         listed=LISTED,
-        data=_embedded(data),
+        data=embedded(data),
         packed=Markup(packed),
         has_series=bool(series),
         parameter=parameter,
@@ -133,8 +130,7 @@ def write_overview(
         by_subject="subject" in recordings.column_names and "subject" not in groups,
         script=Markup(script),
         style=Markup(style),
-        policy=f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "
-        "base-uri 'none'; form-action 'none'",
+        policy=policy([script], "script-src", style_source(style)),
         versions=versions(),
     )
     Path(path).write_text(page, encoding="utf-8")
@@ -361,20 +357,3 @@ def _drawn(means: Sequence[GroupMean]) -> dict[str, Any]:
             for one in means
         ],
     }
-
-
-def _embedded(data: Any) -> Markup:
-    """JSON that cannot end the script element that holds it, whatever texts it has."""
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for character in "<>&\u2028\u2029":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)
-
-
-def _part(name: str) -> str:
-    return resources.files("jaximp.reports").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    """What a content security policy calls the one inline element with this text."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Num
 
 from jaximp.least_squares.window import confidence_interval
+from jaximp.models.endpoint import EndpointImpedance, endpoint_impedance
 from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
 from jaximp.perturbation.isolation.isolated import Impedance
@@ -134,6 +135,11 @@ class ArmEstimate:
     def improved(self) -> KnownArm:
         """What was known, with the inertia as a method improved it."""
         return self.arm if self.own is None else self.arm.with_inertia(self.own.inertia)
+
+    @property
+    def at_hand(self) -> EndpointImpedance:
+        """What is felt at the hand, where it was at the onset."""
+        return endpoint_impedance(self.arm.geometry, self.angles, self.improved.xi, self.D, self.K)
 
     @property
     def inertia(self) -> dict[str, float]:

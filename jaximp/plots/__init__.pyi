@@ -1,3 +1,4 @@
+from . import interactive as interactive
 from .arm import ellipses as ellipses
 from .estimates import condition_over_time as condition_over_time
 from .estimates import effort as effort
@@ -17,11 +18,13 @@ from .posterior import bands as bands
 from .posterior import corner as corner
 from .posterior import ellipse_bands as ellipse_bands
 from .posterior import torque_bands as torque_bands
+from .registry import figure_of as figure_of
 from .style import Panel as Panel
 from .style import curves as curves
-from .style import main_parameter as main_parameter
-from .style import number as number
 from .style import png as png
-from .style import pretty_unit as pretty_unit
-from .style import with_unit as with_unit
-from .style import words as words
+from .words import main_parameter as main_parameter
+from .words import number as number
+from .words import percent as percent
+from .words import pretty_unit as pretty_unit
+from .words import with_unit as with_unit
+from .words import words as words

@@ -25,20 +25,20 @@ from jaximp.plots.style import (
     VERMILLION,
     WIDTH,
     Numbers,
+    believed,
+    beyond,
     bins,
     cycle,
     decades,
     draw_band,
     draw_line,
-    main_parameter,
     mean_of,
-    number,
-    pretty_unit,
     remark,
     styled,
-    with_unit,
 )
-from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, VERDICTS, WEAK
+from jaximp.plots.words import main_parameter, number, pretty_unit, with_unit
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
+from jaximp.types import AnyArray
 
 STRETCHES = 1000
 """Shaded stretches are drawn no finer than this share of the axis."""
@@ -65,7 +65,7 @@ def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
     for panel in panels.flat[n:]:
         panel.set_visible(False)
     for panel in panels[-1]:
-        panel.set_xlabel("end of the window [s]")
+        panel.set_xlabel("middle of the window (s)")
     _legend(figure, panels.flat[0], [estimates])
     return figure
 
@@ -75,23 +75,24 @@ def condition_over_time(estimates: Estimates) -> Figure:
     """How well each window determines its parameters, and how well they explain the torque."""
     figure = Figure(figsize=(WIDTH, 5.0))
     condition, smallest, vaf = figure.subplots(3, 1, sharex=True)
-    draw_line(condition, estimates.end, estimates.fit.cond, color=BLUE)
-    condition.set(ylabel="condition number [1]")
+    middle = middles(estimates)
+    draw_line(condition, middle, estimates.fit.cond, color=BLUE)
+    condition.set(ylabel="condition number (1)")
     decades(condition, estimates.fit.cond, estimates.threshold)
     if estimates.threshold is None:
         remark(condition, "no threshold: it needs a reference position and its period")
     else:
         condition.axhline(estimates.threshold, color=VERMILLION, linestyle=":")
         remark(condition, "dotted: threshold for fake changes, eq. (16)")
-    draw_line(smallest, estimates.end, estimates.fit.sigma_min, color=BLUE)
-    smallest.set(ylabel="smallest singular\nvalue [mixed units]")
+    draw_line(smallest, middle, estimates.fit.sigma_min, color=BLUE)
+    smallest.set(ylabel="smallest singular\nvalue (mixed units)")
     decades(smallest, estimates.fit.sigma_min)
-    draw_line(vaf, estimates.end, estimates.fit.vaf, color=BLUE, label="VAF in the window")
+    draw_line(vaf, middle, estimates.fit.vaf, color=BLUE, label="VAF in the window")
     ahead = estimates.held_out_vaf
-    draw_line(vaf, estimates.end, ahead, color=VERMILLION, linestyle="--", label="VAF in the next window")
+    draw_line(vaf, middle, ahead, color=VERMILLION, linestyle="--", label="VAF in the next window")
     lowest = np.percentile(np.append(ahead[np.isfinite(ahead)], 0.0), 2)
-    vaf.set(ylabel="variance accounted\nfor [1]", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
-    vaf.set_xlabel("end of the window [s]")
+    vaf.set(ylabel="variance accounted\nfor (1)", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
+    vaf.set_xlabel("middle of the window (s)")
     for panel in (condition, smallest, vaf):
         _shade(panel, estimates)
     figure.align_ylabels()
@@ -114,14 +115,14 @@ def torque(estimates: Estimates) -> Figure:
         _torque_lines(upper[-1], lower[-1], estimates, joint, _excerpt(estimates, joint) if long else slice(None))
         what, unit = effort(estimates, joint)
         whose = f"joint {joint + 1}: " if n_joints > 1 else ""
-        upper[0].set_ylabel(f"{whose}{what} [{unit}]")
-        lower[0].set_ylabel(f"residual [{unit}]")
+        upper[0].set_ylabel(f"{whose}{what} ({unit})")
+        lower[0].set_ylabel(f"residual ({unit})")
         _set_torque_limits(upper[0], lower[0], estimates, joint)
     if long:
         panels[0, 0].set_title("whole recording, smallest to largest", loc="left")
         panels[0, 1].set_title(f"{EXCERPT:g} s of it", loc="left")
     for panel in panels[-1]:
-        panel.set_xlabel("time [s]")
+        panel.set_xlabel("time (s)")
         panel.margins(x=0)
     figure.align_ylabels(panels[:, 0])
     _legend(figure, panels[0, -1], [])
@@ -137,7 +138,7 @@ def residual_spectrum(estimates: Estimates) -> Figure:
     for joint, panel in enumerate(panels):
         unit = effort(estimates, joint)[1]
         whose = f"joint {joint + 1}: " if n_joints > 1 else ""
-        panel.set(xlabel="frequency [Hz]", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
+        panel.set(xlabel="frequency (Hz)", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
         _spectra(panel, estimates, joint)
     _legend(figure, max(panels, key=lambda panel: len(panel.get_lines())), [])
     return figure
@@ -153,7 +154,7 @@ def reflex_weights(estimates: Estimates, level: float = 0.95) -> Figure:
         theta = np.asarray(estimates.fit.theta)[:, reflex.columns]
         half = _interval(estimates, level)[1][:, reflex.columns] - theta
         lags = 1e3 * reflex.lags
-        panel.set(xlabel="lag behind the velocity [ms]", ylabel=f"weight [{pretty_unit(reflex.unit)}]")
+        panel.set(xlabel="lag behind the velocity (ms)", ylabel=f"weight ({pretty_unit(reflex.unit)})")
         panel.axhline(0, color=PALE, linewidth=0.8)
         if not trusted.any():
             remark(panel, "no window can be trusted", VERMILLION)
@@ -197,9 +198,12 @@ def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -
     over_time, spread, share = panels["time"], panels["spread"], panels["share"]
     for (color, style), estimates in zip(cycle(LINES, len(several)), several, strict=True):
         theta = np.where(estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k], np.nan)
-        draw_line(over_time, estimates.end, theta, color=color, linestyle=style, label=f"window {estimates.window:g} s")
-    whole = min(estimates.end[0] for estimates in several), max(estimates.end[-1] for estimates in several)
-    over_time.set(xlabel="end of the window [s]", xlim=whole if whole[0] < whole[1] else None, ylim=_limits(several, k))
+        label = f"window {estimates.window:g} s"
+        draw_line(over_time, middles(estimates), theta, color=color, linestyle=style, label=label)
+    ends = np.concatenate([middles(estimates)[[0, -1]] for estimates in several])
+    over_time.set(xlabel="middle of the window (s)", ylim=_limits(several, k))
+    if ends.min() < ends.max():
+        over_time.set_xlim(ends.min(), ends.max())
     over_time.set_title(f"{with_unit(name, unit)}, trusted windows", loc="left")
     over_time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(several), borderaxespad=0)
 
@@ -207,7 +211,7 @@ def window_lengths(several: Sequence[Estimates], parameter: str | None = None) -
     _spread_against_error(spread, length, several, k)
     _share_and_held_out(share, length, several)
     for panel in (spread, share):
-        panel.set(xlabel="window length [s]", xticks=length, xticklabels=[f"{value:g}" for value in length])
+        panel.set(xlabel="window length (s)", xticks=length, xticklabels=[f"{value:g}" for value in length])
         panel.set_xlim(0.9 * length[0], 1.05 * length[-1])
         panel.legend(loc="best")
     return figure
@@ -227,7 +231,7 @@ def methods(several: Sequence[Estimates], parameter: str | None = None) -> Figur
         text, color = _mean_over_trusted(estimates, k)
         remark(panel, text, color)
     figure.supylabel(with_unit(several[0].names[k], several[0].units[k]), fontsize=STYLE["axes.labelsize"])
-    panels[-1].set_xlabel("end of the window [s]")
+    panels[-1].set_xlabel("middle of the window (s)")
     _legend(figure, panels[int(np.argmax([x.verdicts.trusted.sum() for x in several]))], several)
     return figure
 
@@ -238,14 +242,13 @@ def _parameter_panel(
     """Parameter k over time: trusted windows in colour with their interval, the others pale."""
     trusted, theta = estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k]
     low, high = (np.where(trusted, end[:, k], np.nan) for end in _interval(estimates, level))
+    middle = middles(estimates)
     _shade(panel, estimates)
     if trusted.any():
-        draw_line(panel, estimates.end, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
-        draw_band(panel, estimates.end, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
+        draw_line(panel, middle, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
+        draw_band(panel, middle, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
     if not trusted.all():
-        draw_line(
-            panel, estimates.end, np.clip(theta, *_beyond(limits)), color=PALE, linewidth=0.7, label="not trusted"
-        )
+        draw_line(panel, middle, np.clip(theta, *beyond(limits)), color=PALE, linewidth=0.7, label="not trusted")
     panel.set_ylim(limits)
 
 
@@ -263,40 +266,18 @@ def _interval(estimates: Estimates, level: float = 0.95) -> tuple[Numbers, Numbe
 
 def _limits(several: Sequence[Estimates], k: int, level: float = 0.95) -> tuple[float, float]:
     """Range that shows the trusted windows of all: a wild window must not squash the others."""
-    ends = [np.stack(_interval(estimates, level), axis=-1)[:, k] for estimates in several]
-    masks = [estimates.verdicts.trusted for estimates in several]
-    shown = np.concatenate([end[mask] for end, mask in zip(ends, masks, strict=True)]).ravel()
-    share = (0.5, 99.5)
-    if not np.isfinite(shown).any():
-        shown = np.concatenate([np.asarray(estimates.fit.theta)[:, k] for estimates in several])
-        share = (5, 95)
-    shown = shown[np.isfinite(shown)]
-    if not len(shown):
-        return -1.0, 1.0
-    low, high = np.percentile(shown, share)
-    margin = 0.15 * (high - low) or 0.1 * abs(high) or 1.0
-    return float(low - margin), float(high + margin)
-
-
-def _beyond(limits: tuple[float, float]) -> tuple[float, float]:
-    """Far outside of the panel, and yet within what the renderer can count."""
-    span = 100 * (limits[1] - limits[0])
-    return limits[0] - span, limits[1] + span
+    ends = [np.stack(_interval(estimates, level), axis=-1)[estimates.verdicts.trusted, k] for estimates in several]
+    theta = [np.asarray(estimates.fit.theta)[:, k] for estimates in several]
+    return believed(np.concatenate(ends), np.concatenate(theta))
 
 
 def _shade(panel: Axes, estimates: Estimates) -> None:
     """Grey and hatch, one kind per verdict, behind the windows that are not trusted."""
-    is_verdict = estimates.verdicts.verdict[:, None] == np.array(VERDICTS)
-    first = bins(len(is_verdict), STRETCHES)
-    verdict = np.add.reduceat(is_verdict.astype(int), first).argmax(axis=1)
-    end = estimates.end
-    half = np.median(np.diff(end)) / 2 if len(end) > 1 else estimates.window / 2
-    border = np.append(end[first] - half, end[-1] + half)
+    middle = middles(estimates)
+    shaded, (low, high) = stretches(middle, estimates.verdicts.verdict, estimates.window)
     for kind, (grey, hatch) in SHADES.items():
-        mask = np.concatenate([[False], verdict == VERDICTS.index(kind), [False]])
-        change = np.flatnonzero(mask[1:] != mask[:-1])
-        if len(change):
-            left, right = border[change[::2]], border[change[1::2]]
+        if kind in shaded:
+            left, right = shaded[kind]
             panel.broken_barh(
                 np.column_stack([left, right - left]),  # type: ignore[arg-type]
                 (0, 1),
@@ -307,7 +288,30 @@ def _shade(panel: Axes, estimates: Estimates) -> None:
                 hatch=hatch,
                 zorder=0,
             )
-    panel.set_xlim(border[0], border[-1])
+    panel.set_xlim(low, high)
+
+
+def middles(estimates: Estimates) -> Numbers:
+    """(M,) where estimates are drawn [s]: each is an average over its window."""
+    return (estimates.start + estimates.end) / 2
+
+
+def stretches(
+    middle: Numbers, verdict: AnyArray, window: float
+) -> tuple[dict[str, tuple[Numbers, Numbers]], tuple[float, float]]:
+    """Left and right ends [s] of the stretches with each verdict that must not be believed, and the ends of all."""
+    kinds = np.array(list(dict.fromkeys([TRUSTED, *SHADES, *np.asarray(verdict).tolist()])))
+    first = bins(len(verdict), STRETCHES)
+    most = kinds[np.add.reduceat((np.asarray(verdict)[:, None] == kinds).astype(int), first).argmax(axis=1)]
+    half = np.median(np.diff(middle)) / 2 if len(middle) > 1 else window / 2
+    border = np.append(middle[first] - half, middle[-1] + half)
+    found = {}
+    for kind in kinds[1:].tolist():
+        mask = np.concatenate([[False], most == kind, [False]])
+        change = np.flatnonzero(mask[1:] != mask[:-1])
+        if len(change):
+            found[kind] = border[change[::2]], border[change[1::2]]
+    return found, (float(border[0]), float(border[-1]))
 
 
 def _legend(figure: Figure, panel: Axes, several: Sequence[Estimates], *others: Axes) -> None:
@@ -331,7 +335,7 @@ def _legend(figure: Figure, panel: Axes, several: Sequence[Estimates], *others: 
 def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, part: slice) -> None:
     time, measured = estimates.time[part], estimates.torque[part, joint]
     seen, unseen = estimates.reconstructed[part, joint], estimates.predicted[part, joint]
-    far = _beyond(_torque_limits(estimates, joint))
+    far = beyond(torque_limits(estimates.torque[:, joint]))
     draw_line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
     draw_line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label="model, fitted")
     draw_line(
@@ -352,7 +356,7 @@ def _torque_envelopes(upper: Axes, lower: Axes, estimates: Estimates, joint: int
     measured = estimates.torque[:, joint]
     first = bins(len(measured), 100)
     time = estimates.time[first]
-    far = _beyond(_torque_limits(estimates, joint))
+    far = beyond(torque_limits(estimates.torque[:, joint]))
 
     def ends(values: Numbers) -> tuple[Numbers, Numbers]:
         values = np.clip(np.where(np.isfinite(measured), values, np.nan), *far)
@@ -366,8 +370,8 @@ def _torque_envelopes(upper: Axes, lower: Axes, estimates: Estimates, joint: int
         lower.plot(time, end, color=VERMILLION, linestyle="--", linewidth=0.8)
 
 
-def _torque_limits(estimates: Estimates, joint: int) -> tuple[float, float]:
-    measured = estimates.torque[:, joint]
+def torque_limits(measured: Numbers) -> tuple[float, float]:
+    """Of a panel, by what was measured: a model that runs away leaves it."""
     measured = measured[np.isfinite(measured)]
     if not len(measured):
         return -1.0, 1.0
@@ -378,7 +382,7 @@ def _torque_limits(estimates: Estimates, joint: int) -> tuple[float, float]:
 
 def _set_torque_limits(upper: Axes, lower: Axes, estimates: Estimates, joint: int) -> None:
     """Both panels in the scale of the measured torque: a model that runs away leaves the panel."""
-    limits = _torque_limits(estimates, joint)
+    limits = torque_limits(estimates.torque[:, joint])
     upper.set_ylim(limits)
     measured = estimates.torque[:, joint]
     residual = np.abs(np.concatenate([measured - x[:, joint] for x in (estimates.reconstructed, estimates.predicted)]))
@@ -456,7 +460,7 @@ def _share_and_held_out(panel: Axes, length: Numbers, several: Sequence[Estimate
     held_out = [mean_of(estimates.held_out_vaf[estimates.verdicts.trusted]) for estimates in several]
     panel.plot(length, share, "o-", color=BLUE, label="trusted")
     panel.plot(length, held_out, "s--", color=VERMILLION, label="held-out VAF of these")
-    panel.set(ylabel="share of windows, VAF [1]", ylim=(max(-1, np.fmin.reduce(held_out, initial=0.0)) - 0.03, 1.03))
+    panel.set(ylabel="share of windows, VAF (1)", ylim=(max(-1, np.fmin.reduce(held_out, initial=0.0)) - 0.03, 1.03))
 
 
 def _spread_and_error(estimates: Estimates, k: int) -> tuple[float, float]:

@@ -30,10 +30,10 @@ def design(found: Design) -> Figure:
         for value in np.unique([np.ravel(end) for end in np.broadcast_arrays(*ends)]):
             if np.isfinite(value):
                 axis.axhline(value, color=BLACK, linestyle=":", linewidth=0.8)
-        axis.set(ylabel=f"{name}\n[{UNITS[name]}]", xlim=(0, found.period))
+        axis.set(ylabel=f"{name}\n({UNITS[name]})", xlim=(0, found.period))
         axis.tick_params(labelbottom=axis is axes[-1])
     axes[0].set_title(f"One period; dotted: limits. Reached: {', '.join(found.active) or 'none'}")
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel("time (s)")
     if n > 1:
         axes[0].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     _harmonics(spectrum, series)
@@ -48,9 +48,8 @@ def _harmonics(panel: Axes, series: FourierSeries) -> None:
     width = 0.8 / len(amplitude) / period
     for j, row in enumerate(amplitude):
         panel.bar(frequency + (j - (len(amplitude) - 1) / 2) * width, row, width, color=LINES[j % len(LINES)][0])
-    panel.set(
-        title="Amplitude of the velocity", xlabel="frequency [Hz]", ylabel="[rad/s]", xlim=(0, (count + 1) / period)
-    )
+    panel.set(title="Amplitude of the velocity", xlabel="frequency (Hz)", ylabel="velocity (rad/s)")
+    panel.set_xlim(0, (count + 1) / period)
 
 
 def _sliding_condition(panel: Axes, found: Design) -> None:
@@ -61,7 +60,7 @@ def _sliding_condition(panel: Axes, found: Design) -> None:
     panel.axhline(found.condition, color=BLACK, linewidth=0.8, label="whole period")
     panel.set(
         title="Condition number of sliding windows",
-        xlabel="end of the window [s]",
+        xlabel="end of the window (s)",
         xlim=(0, found.period),
         yscale="log",
     )

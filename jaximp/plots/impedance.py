@@ -14,7 +14,8 @@ from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
 from jaximp.perturbation.trials import VOLUNTARY_DELAY
 from jaximp.perturbation.windows import OtherWindows
-from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, pretty_unit, styled
+from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, styled
+from jaximp.plots.words import pretty_unit
 from jaximp.types import Numbers
 
 SHOWN = 4
@@ -37,9 +38,9 @@ def deviations(found: ArmImpedance) -> Figure:
                 color, style = LINES[j % 4]
                 draw_line(panel, time, trial, color=color, linestyle=style, linewidth=0.7, alpha=0.7)
             panel.axhline(0, color=BLACK, linewidth=0.6)
-            panel.set(ylabel=f"{name} {axis} [{unit}]", xlim=(0, time[-1]))
+            panel.set(ylabel=f"{name} {axis} ({unit})", xlim=(0, time[-1]))
     for panel in panels[-1]:
-        panel.set_xlabel("time since the onset [ms]")
+        panel.set_xlabel("time since the onset (ms)")
     panels[0, 0].set_title(f"unperturbed less perturbed, {found.trials} trials", loc="left")
     figure.align_ylabels()
     return figure
@@ -62,9 +63,9 @@ def jerk_spectra(spectra: tuple[Numbers, Numbers, Numbers], cutoff: Numbers | No
         if cutoff is not None:
             panel.axvline(cutoff[k], color=VERMILLION, linestyle="--", label="cut-off")
             panel.set_title(f"axis {axis}: high-pass from {cutoff[k]:.3g} Hz on", loc="left")
-        panel.set(xlabel="frequency [Hz]", xlim=(0, HIGHEST), ylim=(1e-6 * largest, 3 * largest))
+        panel.set(xlabel="frequency (Hz)", xlim=(0, HIGHEST), ylim=(1e-6 * largest, 3 * largest))
         panel.minorticks_off()
-    panels[0].set_ylabel("energy spectral density\nof the jerk [m²/s⁴]")
+    panels[0].set_ylabel("energy spectral density\nof the jerk (m²/s⁴)")
     _legend_below(figure, panels[0])
     return figure
 
@@ -85,9 +86,9 @@ def joint_torques(found: ArmImpedance) -> Figure:
             panel.set_xlim(0, time[-1])
         panels[0, column].set_title(f"perturbed trial {trial + 1}", loc="left")
     for joint, panel in enumerate(panels[:, 0]):
-        panel.set_ylabel(f"torque of joint {joint + 1} [N m]")
+        panel.set_ylabel(f"torque of joint {joint + 1} (N m)")
     for panel in panels[-1]:
-        panel.set_xlabel("since the onset [ms]")
+        panel.set_xlabel("since the onset (ms)")
     figure.align_ylabels()
     _legend_below(figure, panels[0, 0])
     return figure
@@ -113,7 +114,7 @@ def impedance_windows(windows: OtherWindows, chosen: float, level: float = 0.95)
         panel.set(xlim=(length[0], length[-1]), ylim=_limits(theta, low[:, k], high[:, k], at_chosen))
     for name in windows.names:
         if MATRIX_OF[name] == "stiffness":
-            panels[name].set_xlabel("window [ms]")
+            panels[name].set_xlabel("window (ms)")
     _legend_below(figure, panels[windows.names[0]])
     return figure
 
@@ -157,7 +158,7 @@ def _element_panels(figure: Figure, names: Sequence[str]) -> dict[str, Axes]:
             found[name] = panel
         for panel in row[len(wanted) :]:
             panel.remove()
-        row[0].set_ylabel(f"{matrix} [{pretty_unit(unit)}]")
+        row[0].set_ylabel(f"{matrix} ({pretty_unit(unit)})")
         if len(wanted) < columns:  # the panel above the missing one has the ticks of its column
             panels[0, -1].tick_params(labelbottom=True)
     figure.align_ylabels()

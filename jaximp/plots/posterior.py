@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from jaximp.plots.style import BLACK, BLUE, VERMILLION, WIDTH, cycle, draw_band, draw_line, pretty_unit, styled, words
+from jaximp.plots.style import BLACK, BLUE, VERMILLION, WIDTH, cycle, draw_band, draw_line, styled
 from jaximp.plots.style import LINES as STYLES
+from jaximp.plots.words import pretty_unit, words
 from jaximp.posterior.draws import Posterior, PosteriorMany, index_of
 from jaximp.types import AnyArray, Numbers
 
@@ -70,7 +71,7 @@ def corner(
             panel.set(xlim=tuple(limits[:, j]), ylim=(0, 1.08) if i == j else tuple(limits[:, i]))
             _truths(panel, truth or {}, names[j], names[i] if i != j else None)
             width = 40 if n < SMALL else 14
-            labels = [f"{fill(words(names[k]), width)}\n[{pretty_unit(posterior.units[columns[k]])}]" for k in (j, i)]
+            labels = [f"{fill(words(names[k]), width)}\n({pretty_unit(posterior.units[columns[k]])})" for k in (j, i)]
             _label(panel, labels, n)
             _outer_only(panel, i, j, n)
     figure.align_labels()
@@ -179,8 +180,8 @@ def bands(
         draw_line(panel, time, np.median(draws, axis=1), color=BLUE, label="median")
         if truth is not None and name in truth:
             draw_line(panel, time, truth[name], color=BLACK, linestyle="--", linewidth=0.9, label="truth")
-        panel.set_ylabel(f"{words(name)}\n[{pretty_unit(posteriors.units[k])}]")
-    panels[-1].set_xlabel("time [s]")
+        panel.set_ylabel(f"{words(name)}\n({pretty_unit(posteriors.units[k])})")
+    panels[-1].set_xlabel("time (s)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     figure.align_ylabels(panels)
     return figure
@@ -194,7 +195,7 @@ def torque_bands(time: Numbers, torque: Numbers, bands: Numbers) -> Figure:
     draw_band(panel, time, bands[0], bands[-1], color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
     draw_line(panel, time, bands[len(bands) // 2], color=BLUE, label="predicted")
     draw_line(panel, time, torque, color=BLACK, linewidth=0.8, label="measured")
-    panel.set(xlabel="time [s]", ylabel="torque [N m]", xlim=(time[0], time[-1]))
+    panel.set(xlabel="time (s)", ylabel="torque (N m)", xlim=(time[0], time[-1]))
     figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -224,7 +225,7 @@ def ellipse_bands(matrices: Mapping[str, Mapping[str, AnyArray]], units: Mapping
                 panel.fill(*outline, color=color, alpha=shade, linewidth=0)
                 largest = max(largest, float(high.max()))
             handles[name] = panel.plot(*(rays * np.median(radius, axis=0)), color=color, label=name)[0]
-        unit = f" [{pretty_unit(units[quantity])}]" if units and quantity in units else ""
+        unit = f" ({pretty_unit(units[quantity])})" if units and quantity in units else ""
         room = 1.08 * largest
         panel.set(title=quantity, xlabel=f"joint 1{unit}", xlim=(-room, room), ylim=(-room, room), aspect="equal")
     panels[0].set_ylabel("joint 2")

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
 from jaximp.types import Numbers
 
@@ -64,57 +65,27 @@ def styled(function: Callable[P, R]) -> Callable[P, R]:
 
 @styled
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file.
+    """The figure as a PNG file of 256 colours, half as large as one of all colours.
 
     Ticks are made while rendering, so that the style is needed here as well. (`savefig` would draw everything twice.)
     """
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     stream = BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)
+    dots = (figure.dpi, figure.dpi)
+    image.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True, dpi=dots)
     return stream.getvalue()
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number for people: `6.33×10⁻⁵` where a computer writes 6.33e-05, and a dash where there is none."""
-    if not np.isfinite(value):
-        return "–"
-    mantissa, _, exponent = f"{value:.{digits}g}".replace("-", "−").partition("e")
-    if not exponent:
-        return mantissa
-    return f"{mantissa}×10{str(int(exponent.replace('−', '-'))).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
-
-
-def with_unit(name: str, unit: str) -> str:
-    """A parameter as figures and tables call it, such as `offset torque [N m]`."""
-    return f"{words(name)} [{pretty_unit(unit)}]"
-
-
-def words(name: str) -> str:
-    """The name of a parameter without its underscores."""
-    return name.replace("_", " ").replace(".", " ")
-
-
-def pretty_unit(unit: str) -> str:
-    """A unit with its exponents raised."""
-    return unit.replace("^2", "²")
-
-
-def main_parameter(names: Sequence[str]) -> str:
-    """The parameter that stands for all where only one is shown: the stiffness, else the first."""
-    return next((name for name in names if name.endswith("stiffness")), names[0])
 
 
 def draw_line(panel: Axes, x: Numbers, y: Any, **style: Any) -> None:
     """A line, thinned where it is long; the small dots show windows that stand alone."""
-    x, y = np.asarray(x), np.asarray(y, float)
-    if len(x) > POINTS:
-        first = bins(len(x), POINTS // 2)
-        x = np.repeat(x[first], 2)
-        y = np.column_stack([np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)]).ravel()
-    alone = len(x) <= POINTS and bool(_is_alone(y).any())
-    panel.plot(x, y, marker="." if alone else "", markersize=2, **style)
+    x, (y,) = envelope(np.asarray(x), [np.asarray(y, float)])
+    dotted = len(x) <= POINTS and bool(alone(y).any())
+    panel.plot(x, y, marker="." if dotted else "", markersize=2, **style)
 
 
-def _is_alone(y: Numbers) -> NDArray[np.bool_]:
+def alone(y: Numbers) -> NDArray[np.bool_]:
     """Points between two gaps, which a line does not show."""
     counts = np.isfinite(y)
     return counts & ~np.append(False, counts[:-1]) & ~np.append(counts[1:], False)
@@ -123,6 +94,15 @@ def _is_alone(y: Numbers) -> NDArray[np.bool_]:
 def draw_band(panel: Axes, x: Numbers, low: Numbers, high: Numbers, **style: Any) -> None:
     first = bins(len(x), POINTS // 2)
     panel.fill_between(x[first], np.fmin.reduceat(low, first), np.fmax.reduceat(high, first), **style)
+
+
+def envelope(x: Numbers, several: Sequence[Numbers], points: int = POINTS) -> tuple[Numbers, list[Numbers]]:
+    """The same lines over x; of more than `points`, the smallest and the largest value of each of half as many bins."""
+    if len(x) <= points:
+        return x, list(several)
+    first = bins(len(x), points // 2)
+    ends = [np.column_stack([np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)]).ravel() for y in several]
+    return np.repeat(x[first], 2), ends
 
 
 def bins(n: int, limit: int) -> NDArray[np.int64]:
@@ -141,13 +121,37 @@ def mean_of(values: Numbers) -> float:
 
 def decades(panel: Axes, values: Any, *others: float | None) -> None:
     """A logarithmic axis over whole decades, so that noise does not look like a change."""
+    panel.set_yscale("log")
+    panel.set_ylim(decade_limits(values, *others))
+    panel.minorticks_off()
+
+
+def decade_limits(values: Any, *others: float | None) -> tuple[float, float]:
+    """Whole decades that hold all values, from 1 to 10 where there is none."""
     shown = np.append(np.asarray(values, float), [other for other in others if other is not None])
     shown = shown[np.isfinite(shown) & (shown > 0)].clip(1e-16, 1e16)  # beyond, it is rounding
-    panel.set_yscale("log")
-    if len(shown):
-        low, high = np.log10(shown.min()), np.log10(shown.max())
-        panel.set_ylim(10 ** np.floor(low - 0.1), 10 ** np.ceil(high + 0.1))
-    panel.minorticks_off()
+    if not len(shown):
+        return 1.0, 10.0
+    low, high = np.log10(shown.min()), np.log10(shown.max())
+    return float(10 ** np.floor(low - 0.1)), float(10 ** np.ceil(high + 0.1))
+
+
+def believed(ends: Numbers, values: Numbers) -> tuple[float, float]:
+    """Range that shows the `ends` of trusted intervals, or else most values: a wild one must not squash the others."""
+    shown, share = ends[np.isfinite(ends)], (0.5, 99.5)
+    if not len(shown):
+        shown, share = values[np.isfinite(values)], (5, 95)
+    if not len(shown):
+        return -1.0, 1.0
+    low, high = np.percentile(shown, share)
+    margin = 0.15 * (high - low) or 0.1 * abs(high) or 1.0
+    return float(low - margin), float(high + margin)
+
+
+def beyond(limits: tuple[float, float]) -> tuple[float, float]:
+    """Far outside of a panel, and yet within what a renderer can count."""
+    span = 100 * (limits[1] - limits[0])
+    return limits[0] - span, limits[1] + span
 
 
 def remark(panel: Axes, text: str, color: str = "0.3") -> None:

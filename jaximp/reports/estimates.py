@@ -9,12 +9,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximp import plots
@@ -25,18 +23,31 @@ from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint
+from jaximp.plots.words import main_parameter, number, percent, pretty_unit, words
 from jaximp.reports.pages import (
-    inline,
-    percent,
+    Alert,
+    Column,
+    Page,
+    Part,
+    Prose,
+    Section,
+    Table,
+    closing_sections,
+    digits,
+    figure_sections,
     table_of,
-    template,
     versions,
     without_nan,
-    write_figures,
-    write_summary,
+    write_page,
+    write_table,
 )
-from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK
+from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
 from jaximp.types import Recording
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from jaximp.plots.interactive import Live
 
 REMEDIES = {
     TRUSTED: "",
@@ -51,8 +62,8 @@ REMEDIES = {
 """What to do about windows with a verdict, in one sentence."""
 
 CAPTIONS = {
-    "parameters": "Each estimate is an average over its window, drawn at the window's end: a steady change appears "
-    "half a window late. The interval holds the truth with probability 95 % if model and noise are as assumed and "
+    "parameters": "Each estimate is an average over its window and stands at the window's middle; what changes faster "
+    "is blurred. The interval holds the truth with probability 95 % if model and noise are as assumed and "
     "nothing changes inside the window. Shaded stretches must not be believed.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
     "each sample (fitted), and with those of a window that had not seen it (held out).",
@@ -67,6 +78,47 @@ CAPTIONS = {
     "methods": "The same windows by several methods of telling the human from the robot.",
 }
 """Figures in the order of the report, and how to read them."""
+
+
+TITLES = {
+    "parameters": "Parameters over time",
+    "torque": "Torque",
+    "condition": "Condition of the windows",
+    "residual_spectrum": "Spectrum of the residual",
+    "reflex": "Reflex",
+    "window_lengths": "Window lengths",
+    "methods": "Methods",
+}
+
+
+def live_figures(estimates: Estimates) -> dict[str, Live]:
+    """What a reader can zoom and ask. Figures know no `Estimates`: what they need of it is read here alone."""
+    from jaximp.plots.interactive import Quality, Torque, Windows, over_time
+
+    shown, fit, verdicts = estimates.summarised(), estimates.fit, estimates.verdicts
+    value = np.asarray(shown.fit.theta)
+    low, high = (np.asarray(end) for end in confidence_interval(value, np.asarray(shown.fit.stderr), shown.fit.dof))
+    condition, vaf, held_out = np.asarray(fit.cond), np.asarray(fit.vaf), np.asarray(estimates.held_out_vaf)
+    told = zip(condition.tolist(), vaf.tolist(), held_out.tolist(), strict=True)
+    remarks = [
+        f"Condition number {number(cond, 3)}, VAF {number(share, 3)}, next window {number(ahead, 3)}."
+        for cond, share, ahead in told
+    ]
+    windows = Windows(
+        shown.names, shown.units, estimates.start, estimates.end, value, low, high, verdicts.verdict, verdicts.reason,
+        remark=remarks,
+    )  # fmt: skip
+    joints = range(estimates.torque.shape[1])
+    efforts = [plots.effort(estimates, joint) for joint in joints]
+    names = [
+        f"{what}{f' of joint {k + 1}' if len(efforts) > 1 else ''} ({unit})" for k, (what, unit) in enumerate(efforts)
+    ]
+    models = {
+        "model, fitted": estimates.reconstructed,
+        "model, held out (window before)": estimates.predicted,
+    }
+    quality = Quality(condition, np.asarray(fit.sigma_min), vaf, held_out, estimates.threshold)
+    return over_time(windows, Torque(estimates.time, names, estimates.torque, models), quality)
 
 
 def write_results(
@@ -88,16 +140,13 @@ def write_results(
     human = job.models(recording.joints, recording.sample_rate)[1]
     for k, estimates in enumerate(estimates_list):
         name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
-        pq.write_table(estimates_table(estimates, human, job), folder / f"{name}.parquet")
-    figures = draw_figures(estimates_list, lengths)
-    write_figures(folder, figures)
+        write_table(folder / f"{name}.parquet", estimates_table(estimates, human, job))
     content = summary(estimates_list, job, recording, lengths)
-    write_summary(folder, content)
-    write_report(folder / "report.html", estimates_list, lengths, job, recording, figures)
+    write_page(folder, page(estimates_list, lengths, content), content)
 
 
-def draw_figures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) -> dict[str, bytes]:
-    """All figures of a report as PNG files, drawn once for the folder and the page."""
+def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) -> dict[str, bytes]:
+    """All figures of a report as PNG files."""
     main = estimates_list[0]
     figures = {
         "parameters": plots.parameters_over_time(main.summarised()),
@@ -114,35 +163,144 @@ def draw_figures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimate
     return {name: plots.png(figure) for name, figure in figures.items()}
 
 
-def write_report(
-    path: str | Path,
-    estimates_list: Sequence[Estimates],
-    lengths: Sequence[Estimates],
-    job: Job,
-    recording: Recording,
-    figures: Mapping[str, bytes] | None = None,
-) -> None:
-    """Write one HTML file that needs no other file, no network and no script.
-
-    **Arguments:** as `write_results`; `figures` PNG files by name, where they are drawn already.
-    """
-    images = draw_figures(estimates_list, lengths) if figures is None else figures
-    content = summary(estimates_list, job, recording, lengths)
-    found = content["windows"]["verdicts"]
-    verdicts = [
-        {"name": name, **found[name], "remedy": REMEDIES[name], "example": _example(estimates_list[0], name)}
-        for name in VERDICTS
-        if found[name]["count"]
-    ]
-    page = template("report.jinja").render(
-        content=content,
-        verdicts=verdicts,
-        notes=_notes(content),
-        main=plots.main_parameter(estimates_list[0].names),
-        figures=inline(images, CAPTIONS),
-        settings=_settings(content),
+def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], content: dict[str, Any]) -> Page:
+    """The report on a `summary`."""
+    images, recording, windows = pictures(estimates_list, lengths), content["recording"], content["windows"]
+    main = main_parameter(estimates_list[0].names)
+    below = {
+        "methods": [_comparison("Method", main, {str(one["method"]): one for one in _all_methods(content)})],
+        "window_lengths": [
+            _comparison("Window", main, {f"{number(one['window_s'])} s": one for one in content["window_lengths"]})
+        ],
+    }
+    method = f", method {content['method']}" if content["method"] else ""
+    return Page(
+        title=recording["name"],
+        subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
+        f"{windows['count']} windows of {digits(content['window_s'])} s{method}",
+        sections=[
+            Section("", [*_warning(estimates_list[0], windows), *_answer(content)], void=not windows["trusted"]),
+            _verdicts(estimates_list[0], content),
+            *figure_sections(images, TITLES, CAPTIONS, below),
+            *_robot_alone(content),
+            *closing_sections("Sampling, filters and limits", _settings(content), content["job"]),
+        ],
+        pictures=images,
+        live=live_figures(estimates_list[0]),
     )
-    Path(path).write_text(page, encoding="utf-8")
+
+
+def _warning(estimates: Estimates, windows: dict[str, Any]) -> list[Alert]:
+    """What is said before any number where few windows are trusted."""
+    count, trusted = windows["count"], windows["trusted"]
+    if not trusted:
+        lines = [
+            f"{of['count']} of {count} windows: {verdict}, such as: {_example(estimates, verdict)}."
+            for verdict, of in windows["verdicts"].items()
+            if of["count"]
+        ]
+        return [Alert("refusal", "No window can be trusted: there is no answer to report.", lines)]
+    if windows["trusted_share"] < 0.5:
+        share = percent(windows["trusted_share"])
+        heading = f"Only {trusted} of {count} windows ({share}) can be trusted."
+        return [Alert("caution", heading, ["The numbers below come from these alone."])]
+    return []
+
+
+def _answer(content: dict[str, Any]) -> list[Part]:
+    """The parameters, of a geared joint on both sides of the gear."""
+    remark = Prose(
+        "Where the spread between windows exceeds the interval of one window, the parameter changes over time and its "
+        "mean stands for no single moment: see below how it does.",
+        remark=True,
+    )
+    if content["at_joint"] is None:
+        return [_parameter_table(content), remark]
+    also = Prose("These are at the joint. The same on the motor's side of the gear, as in the table and the figures:")
+    return [_parameter_table(content["at_joint"]), remark, also, _parameter_table(content)]
+
+
+def _parameter_table(found: dict[str, Any]) -> Table:
+    rows = []
+    for name, value in found["parameters"].items():
+        half, mean = value["half_width_95"], value["mean"]
+        interval = "–"
+        if half is not None:
+            interval = f"± {number(half, 2)}" + (", holds zero" if mean is not None and abs(mean) < half else "")
+        rows.append([words(name), digits(mean), interval, digits(value["sd"], 2), pretty_unit(value["unit"])])
+    medians = {f"{words(name)} (median)": value for name, value in found["equilibrium"].items()}
+    medians |= {f"{words(name)} mean delay (median)": value["delay"] for name, value in found["reflex"].items()}
+    for name, value in medians.items():
+        rows.append([name, digits(value["median"]), "", digits(value["sd"], 2), pretty_unit(value["unit"])])
+    heads = (
+        ("Mean over trusted windows", "answer"),
+        ("95 % interval of one window", "number"),
+        ("Spread (sd)", "number"),
+    )
+    return Table([Column("Parameter", "text"), *(Column(*head) for head in heads), Column("Unit", "text")], rows)
+
+
+def _verdicts(estimates: Estimates, content: dict[str, Any]) -> Section:
+    """How many windows have which verdict, why, and what to do; and what their model explains."""
+    windows = content["windows"]
+    rows = [
+        [verdict, str(of["count"]), percent(of["share"]), _example(estimates, verdict), REMEDIES[verdict]]
+        for verdict, of in windows["verdicts"].items()
+        if of["count"]
+    ]
+    columns = [Column("Verdict", "text"), Column("Windows"), Column("Share")]
+    columns += [Column("For example", "text"), Column("What to do", "text")]
+    parts: list[Part] = [Table(columns, rows), Prose(_explained(content))]
+    notes = _notes(content)
+    if notes:
+        parts.append(Alert("notes", items=notes))
+    return Section(f"{windows['trusted']} of {windows['count']} windows can be trusted", parts)
+
+
+def _explained(content: dict[str, Any]) -> str:
+    if not content["windows"]["trusted"]:
+        share = percent(content["mean_vaf_of_all_windows"])
+        return f"Over all windows the model explains {share} of the torque's variance."
+    vaf, held_out = content["mean_vaf"], content["mean_held_out_vaf"]
+    text = f"In trusted windows the model explains {percent(vaf)} of the torque's variance"
+    if held_out is not None:
+        text += f", and {percent(held_out)} in the window that follows, which it has not seen"
+        if vaf - held_out > 0.1:
+            text += ". That is much less: the parameters change from window to window, or follow the noise"
+    return f"{text}."
+
+
+def _comparison(head: str, main: str, results: Mapping[str, dict[str, Any]]) -> Table:
+    """One parameter of several results; grey where fewer than half of the windows are trusted."""
+    rows = []
+    for name, result in results.items():
+        value = result["parameters"][main]
+        shares = percent(result["windows"]["trusted_share"]), percent(result["mean_held_out_vaf"])
+        rows.append([name, digits(value["mean"]), digits(value["sd"], 2), digits(value["median_stderr"], 2), *shares])
+    heads = (f"{words(main)}, mean", "answer"), ("Spread (sd)", "number"), ("Standard error", "number")
+    columns = [
+        Column(head, "text"),
+        *(Column(*one) for one in heads),
+        Column("Trusted windows"),
+        Column("Held-out VAF"),
+    ]
+    void = [k for k, result in enumerate(results.values()) if result["windows"]["trusted_share"] < 0.5]
+    return Table(columns, rows, void, "Means over trusted windows; grey where these are fewer than half.")
+
+
+def _robot_alone(content: dict[str, Any]) -> list[Section]:
+    if not content["robot"]:
+        return []
+    columns = [Column("Parameter", "text"), Column("Estimate"), Column("Standard error"), Column("Unit", "text")]
+    rows = [
+        [words(name), digits(value["value"]), digits(value["stderr"], 2), pretty_unit(value["unit"])]
+        for name, value in content["robot"].items()
+    ]
+    return [Section("Robot alone", [Table(columns, rows)])]
+
+
+def _all_methods(content: dict[str, Any]) -> list[dict[str, Any]]:
+    return [content, *content["further_methods"]]
 
 
 def summary(
@@ -380,7 +538,7 @@ def _example(estimates: Estimates, verdict: str) -> str:
 def _notes(content: dict[str, Any]) -> list[str]:
     """What the results say of themselves; what a further method repeats is told once."""
     told: dict[str, str] = {}
-    for result in (content, *content["further_methods"]):
+    for result in _all_methods(content):
         for note in result["notes"]:
             whose = result is not content or note == result["method_description"]
             told.setdefault(note, f"method {result['method']}: {note}" if whose else note)

@@ -2,46 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Array
 
 from jaximp import plots
 from jaximp.jobs.job import Job
 from jaximp.jobs.run_trials import TrialsResult
-from jaximp.models.endpoint import (
-    Ellipse,
-    EndpointImpedance,
-    ellipse,
-    endpoint_damping,
-    endpoint_impedance,
-    endpoint_stiffness,
-    propagated_stderr,
-)
+from jaximp.models.endpoint import Ellipse, ellipse, endpoint_damping, endpoint_stiffness, propagated_stderr
 from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.isolation.output_error import MISFIT
-from jaximp.perturbation.stiffness import MATRICES
+from jaximp.perturbation.stiffness import MATRICES, MATRIX_OF
+from jaximp.plots.words import number, percent, pretty_unit
 from jaximp.reports.pages import (
-    inline,
-    percent,
+    Alert,
+    Column,
+    Page,
+    Part,
+    Prose,
+    Section,
+    Table,
+    capitalised,
+    closing_sections,
+    digits,
+    figure_sections,
     table_of,
-    template,
     versions,
     without_nan,
-    write_figures,
-    write_summary,
+    write_page,
+    write_table,
 )
+from jaximp.trust.verdicts import TRUSTED
 from jaximp.types import Numbers
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from jaximp.plots.interactive import Live
 
 TITLES = {
     "deviations": "What the perturbations changed",
@@ -67,25 +71,34 @@ CAPTIONS = {
 """Figures in the order of the report, and how to read them."""
 
 
+def live_figures(result: TrialsResult) -> dict[str, Live]:
+    """What a reader can zoom and ask. Figures know no `ArmImpedance`: what they need of it is read here alone."""
+    from jaximp.plots import interactive
+
+    main = result.main
+    position, force = np.asarray(main.curves.deviations.position), np.asarray(main.curves.deviations.force)
+    hands = {METHODS[one.method].short: one.at_hand for one in result.estimates}
+    return {
+        "deviations": interactive.deviations(position, force, main.curves.sample_rate),
+        "ellipses": interactive.ellipses(main.arm.geometry, main.angles, hands),
+    }
+
+
 def write_trials_results(folder: str | Path, result: TrialsResult, job: Job) -> None:
     """Write `estimates.parquet`, `summary.json`, `report.html` and every figure as a PNG file into a folder."""
-    folder = Path(folder)
-    figures = draw_figures(result)
-    content = summary(result, job)
-    pq.write_table(estimates_table(result, job), folder / "estimates.parquet")
-    write_figures(folder, figures)
-    write_summary(folder, content)
-    write_report(folder / "report.html", result, job, figures)
+    folder, content = Path(folder), summary(result, job)
+    write_table(folder / "estimates.parquet", estimates_table(result, job))
+    write_page(folder, page(result, content), content)
 
 
-def draw_figures(result: TrialsResult) -> dict[str, bytes]:
+def pictures(result: TrialsResult) -> dict[str, bytes]:
     """All figures of a report as PNG files."""
     main = result.main
     figures = {"deviations": plots.deviations(main)}
     if main.misfit is None:  # a method that need not know the acceleration well has no torques to show
         figures["torques"] = plots.joint_torques(main)
     figures["ellipses"] = plots.ellipses(
-        main.arm.geometry, main.angles, {METHODS[one.method].short: _at_hand(one) for one in result.estimates}
+        main.arm.geometry, main.angles, {METHODS[one.method].short: one.at_hand for one in result.estimates}
     )
     if result.spectra is not None:
         cutoff = next((one.curves.cutoff for one in result.estimates if one.curves.cutoff is not None), None)
@@ -97,22 +110,81 @@ def draw_figures(result: TrialsResult) -> dict[str, bytes]:
     return {name: plots.png(figure) for name, figure in figures.items()}
 
 
-def write_report(path: str | Path, result: TrialsResult, job: Job, figures: Mapping[str, bytes] | None = None) -> None:
-    """Write one HTML file that needs no other file, no network and no script.
-
-    **Arguments:** `figures` PNG files by name, where they are drawn already.
-    """
-    images = draw_figures(result) if figures is None else figures
-    content = summary(result, job)
-    page = template("impedance.jinja").render(
-        content=content,
-        words=in_words,
-        made_of=BASE_INERTIA,
-        titles=TITLES,
-        figures=inline(images, CAPTIONS),
-        settings=_settings(content),
+def page(result: TrialsResult, content: dict[str, Any]) -> Page:
+    """The report on a `summary`."""
+    images, trusted = pictures(result), content["verdict"] == TRUSTED
+    alerts = []
+    if not trusted:
+        heading = f"This estimate cannot be trusted: {content['verdict']}."
+        alerts.append(Alert("refusal", heading, [f"{capitalised(content['reason'])}."]))
+    if content["warnings"]:
+        alerts.append(Alert("caution", items=content["warnings"]))
+    notes = [Alert("notes", items=content["notes"])] if content["notes"] else []
+    return Page(
+        title=content["recording"]["name"],
+        subtitle=f"Damping and stiffness of an arm's joints from {content['trials']} perturbed movements, "
+        f"{number(1000 * content['window_s'])} ms after the onset, by {content['method_description']}",
+        sections=[
+            Section("", alerts),
+            Section("", [_answer(content), *_explained(content)], void=not trusted),
+            Section("", notes),
+            *figure_sections(images, TITLES, CAPTIONS, {"methods": [_methods(content)]}),
+            *closing_sections("Trials, arm and limits", _settings(content), content["job"]),
+        ],
+        pictures=images,
+        live=live_figures(result),
     )
-    Path(path).write_text(page, encoding="utf-8")
+
+
+def _answer(content: dict[str, Any]) -> Table:
+    rows = []
+    for name, value in content["parameters"].items():
+        low, high = value["low_95"], value["high_95"]
+        interval = "–" if low is None else f"{digits(low, 3)} to {digits(high, 3)}"
+        error, unit = digits(value["stderr"], 2), pretty_unit(value["unit"])
+        rows.append([f"{MATRIX_OF[name]} {name[-2:]}", digits(value["value"]), error, interval, unit])
+    for name, made_of in BASE_INERTIA.items():
+        value, error = content["inertia_kgm2"][name], content["inertia_stderr_kgm2"][name]
+        rows.append([f"{in_words(name)}, {made_of} (known)", digits(value), digits(error, 2), "", "kg m²"])
+    columns = [Column("Parameter", "text"), Column("Estimate", "answer"), Column("Standard error")]
+    return Table([*columns, Column("95 % interval"), Column("Unit", "text")], rows)
+
+
+def _explained(content: dict[str, Any]) -> list[Part]:
+    """What the numbers above are, and how well they explain the trials."""
+    symmetric = "" if "stiffness_21" in content["parameters"] else "; stiffness 21 is stiffness 12"
+    known = any(error is not None for error in content["inertia_stderr_kgm2"].values())
+    errors = " and from the standard errors of the inertia" if known else ""
+    remark = (
+        f"Indices 1 and 2 are shoulder and elbow{symmetric}. The intervals come from how much the trials contradict "
+        f"each other{errors}; they do not know what all trials have in common, such as a wrong length of the arm."
+    )
+    if content["misfit"] is None:
+        vaf, held_out = percent(content["vaf"]), percent(content["held_out_vaf"])
+        text = (
+            f"Damping and stiffness account for {vaf} of the torque that the perturbations make; from half of the "
+            f"trials, {held_out} of the torque of the others is predicted."
+        )
+    else:
+        text = f"The residuals are {number(content['misfit'], 3)} times as large as expected (mean squares)."
+    return [Prose(remark, remark=True), Prose(text)]
+
+
+def _methods(content: dict[str, Any]) -> Table:
+    several = [content, *content["further_methods"]]
+    rows = [
+        [
+            f"{one['method_short']}: {one['method_description']}",
+            one["verdict"],
+            percent(one["vaf"]),
+            percent(one["held_out_vaf"]),
+            one["reason"],
+        ]
+        for one in several
+    ]
+    columns = [Column("Method", "text"), Column("Verdict", "text"), Column("VAF"), Column("Held-out VAF")]
+    void = [k for k, one in enumerate(several) if one["verdict"] != TRUSTED]
+    return Table([*columns, Column("Why", "text")], rows, void)
 
 
 def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
@@ -150,10 +222,10 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
 
 def endpoint(found: ArmImpedance) -> dict[str, Any]:
     """Impedance at the hand where it was at the onset, and its ellipses, with the standard errors of D and K."""
-    at_hand = _at_hand(found)
+    hand = found.at_hand
     content: dict[str, Any] = {"position_m": found.position.tolist(), "angles_rad": found.angles.tolist()}
     for name, unit in (("inertia", "kg"), ("damping", "Ns_per_m"), ("stiffness", "N_per_m")):
-        matrix = getattr(at_hand, name)
+        matrix = getattr(hand, name)
         content[f"{name}_{unit}"] = np.asarray(matrix).tolist()
         content[f"{name}_ellipse"] = _in_plain_numbers(ellipse(matrix))
         if name in MATRICES:
@@ -162,10 +234,6 @@ def endpoint(found: ArmImpedance) -> dict[str, Any]:
             )
             content[f"{name}_ellipse_stderr"] = _in_plain_numbers(spread)
     return content
-
-
-def _at_hand(found: ArmImpedance) -> EndpointImpedance:
-    return endpoint_impedance(found.arm.geometry, found.angles, found.improved.xi, found.D, found.K)
 
 
 def _ellipse_of(found: ArmImpedance, matrix: str, theta: Array) -> Ellipse:
@@ -292,12 +360,12 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
     recording, arm, limits = content["recording"], content["arm"], content["trust_limits"]
 
     def numbers(values: list[float], unit: str) -> str:
-        return f"{', '.join(plots.number(value) for value in values)} {unit}"
+        return f"{', '.join(number(value) for value in values)} {unit}"
 
     def known_inertia(name: str) -> str:
         error = content["inertia_stderr_kgm2"][name]
-        value = plots.number(content["inertia_kgm2"][name])
-        return f"{value} kg m²" if error is None else f"{value} ± {plots.number(error, 2)} kg m²"
+        value = number(content["inertia_kgm2"][name])
+        return f"{value} kg m²" if error is None else f"{value} ± {number(error, 2)} kg m²"
 
     cutoff = content["cutoff_hz"]
     whence = "as given" if arm["inertia_from"] == "given" else f"from {arm['inertia_from']}"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,14 +12,35 @@ from jaximp import plots
 from jaximp.jobs.job import Job
 from jaximp.jobs.run_trials import TrialsResult
 from jaximp.least_squares.noise import ATTENUATION
+from jaximp.plots.words import pretty_unit, words
 from jaximp.posterior.densities import stiffness_matrices
 from jaximp.posterior.draws import Posterior, summarise
 from jaximp.posterior.files import save_posterior
-from jaximp.posterior.inference import Inference, sentences
-from jaximp.reports.pages import inline, template, versions, without_nan, write_figures, write_summary
+from jaximp.posterior.inference import LEVELS, Inference, sentences
+from jaximp.reports.pages import (
+    Alert,
+    Column,
+    Page,
+    Part,
+    Prose,
+    Section,
+    Table,
+    capitalised,
+    closing_sections,
+    digits,
+    figure_sections,
+    versions,
+    without_nan,
+    write_page,
+)
 from jaximp.trust.verdicts import TRUSTED
 from jaximp.types import Numbers
 
+if TYPE_CHECKING:
+    from jaximp.plots.interactive import Live
+
+UNCONVERGED = "draws not to be trusted"
+"""What is said of a window that `identify` trusts, and whose draws have not converged."""
 TITLES = {
     "bands": "Parameters over time",
     "torque": "Torque that the posterior predicts",
@@ -42,6 +63,39 @@ CORNER = 12
 """Parameters that are shown two by two, at most: the last ones, which are the stiffnesses."""
 
 
+def live_figures(found: Inference, shown: Sequence[str], changes: Sequence[dict[str, Any]]) -> dict[str, Live]:
+    """What a reader can zoom and ask. Figures know no `Inference`: what they need of it is read here alone."""
+    from jaximp.plots.interactive import Torque, Windows, over_time
+
+    windows = found.summarised[1]
+    if windows is None or not len(found.end):
+        return {}
+    names = [name for name in shown if name in windows.names]
+    samples = windows.samples[..., [windows.names.index(name) for name in names]]
+    low, lower, middle, upper, high = np.quantile(samples, LEVELS, axis=1)
+    reasons = [found.reason(k) for k in range(len(found.end))]
+    verdict = np.where(found.good, TRUSTED, np.where(found.verdicts.trusted, UNCONVERGED, found.verdicts.verdict))
+    rise = np.full(middle.shape, np.nan)
+    for change in changes:
+        rise[np.flatnonzero(found.end == change["to_s"])[0]] = [change["probability"].get(name) for name in names]
+    over = Windows(
+        names, [windows.units[windows.names.index(name)] for name in names], found.start, found.end, middle, low, high,
+        verdict, reasons, inner=[(lower, upper)], rise=rise if changes else None, interval="95 % credible interval",
+        remark=[_rises(dict(zip(names, row, strict=True))) for row in rise.tolist()],
+    )  # fmt: skip
+    outputs = found.torque.shape[1]
+    torques = [f"torque{f' of output {k + 1}' if outputs > 1 else ''} (N m)" for k in range(outputs)]
+    median = found.bands[len(LEVELS) // 2]
+    torque = Torque(found.time, torques, found.torque, {"predicted": median}, (found.bands[0], found.bands[-1]))
+    drawn = over_time(over, torque)
+    return {"bands": drawn["parameters"], "torque": drawn["torque"]}
+
+
+def _rises(probability: Mapping[str, float]) -> str:
+    known = [f"{words(name)} {chance:.3f}" for name, chance in probability.items() if np.isfinite(chance)]
+    return f"Greater than in the window before, with probability: {', '.join(known)}." if known else ""
+
+
 def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> dict[str, Any]:
     """Write `posterior.nc` (whole record), `windows.nc`, `summary.json`, `report.html` and the figures.
 
@@ -58,13 +112,14 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     if found.windows is not None and windows is not None:
         save_posterior(folder / "windows.nc", found.windows, found.end)
         if found.good.any():
-            figures["bands"] = plots.bands(found.end, windows, shown, trusted=found.good)
+            figures["bands"] = plots.bands((found.start + found.end) / 2, windows, shown, trusted=found.good)
     content = _content(job, whole, "the whole record", shown, _remarks(found, job.posterior.heavy_tails), found.why)
-    content["changes"] = _changes(found, shown)
+    changes = _changes(found, shown)
+    content["changes"] = changes
     content["held_out_log_score"] = None if found.score is None else list(found.score)
     content["share_of_torque_in_95_percent_band"] = found.inside
     content["windows"] = _windows(found)
-    return _write(folder, content, figures)
+    return _write(folder, content, figures, live_figures(found, shown, changes))
 
 
 def write_arm_posterior(folder: str | Path, result: TrialsResult, posterior: Posterior, job: Job) -> dict[str, Any]:
@@ -78,7 +133,7 @@ def write_arm_posterior(folder: str | Path, result: TrialsResult, posterior: Pos
     why = posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
     of = f"the impedance of {found.trials} perturbed movements"
     content = _content(job, posterior, of, list(posterior.names), [*found.warnings, *result.notes], why)
-    return _write(folder, content | {"changes": []}, figures)
+    return _write(folder, content | {"changes": []}, figures, {})
 
 
 def _content(
@@ -173,11 +228,73 @@ def _torque(found: Inference, length: float) -> Any:
     return plots.torque_bands(found.time[shown], found.torque[shown, 0], bands[:, shown])
 
 
-def _write(folder: Path, content: dict[str, Any], figures: dict[str, Any]) -> dict[str, Any]:
+def _write(folder: Path, content: dict[str, Any], figures: dict[str, Any], live: Mapping[str, Live]) -> dict[str, Any]:
     content = without_nan(content)
     images = {name: plots.png(figure) for name, figure in figures.items()}
-    write_figures(folder, images)
-    write_summary(folder, content)
-    page = template("posterior.jinja").render(content=content, titles=TITLES, figures=inline(images, CAPTIONS))
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    write_page(folder, _page(content, images, {name: one for name, one in live.items() if name in images}), content)
     return content
+
+
+def _page(content: dict[str, Any], images: dict[str, bytes], live: Mapping[str, Live]) -> Page:
+    """The report on a summary."""
+    why = content["why"]
+    alerts = [Alert("refusal", content["heading"], [f"{capitalised(why)}."])] if why else []
+    paper = [] if why else [Prose(f"For a paper: {'; '.join(content['sentences'])}.")]
+    notes = [Alert("notes", items=content["remarks"])] if content["remarks"] else []
+    return Page(
+        title=content["name"],
+        subtitle=f"Posterior of {content['of']}: {content['sampler']}",
+        sections=[
+            Section("", alerts),
+            Section("", [_parameter_table(content["parameters"]), *paper], void=bool(why)),
+            Section("", notes),
+            *figure_sections(images, TITLES, CAPTIONS, {"bands": _change_table(content["changes"])}),
+            *closing_sections("", {}, content["job"]),
+        ],
+        pictures=images,
+        live=live,
+    )
+
+
+def _parameter_table(parameters: Sequence[dict[str, Any]]) -> Table:
+    heads = [Column("Median", "answer"), Column("Standard deviation"), Column("95 % credible interval")]
+    heads += [Column("Effective samples"), Column("R-hat"), Column("Unit", "text")]
+    rows = [
+        [
+            words(row["name"]),
+            digits(row["50%"]),
+            digits(row["sd"], 2),
+            f"{digits(row['2.5%'])} to {digits(row['97.5%'])}",
+            digits(row["ess"], 3),
+            digits(row["rhat"], 3),
+            pretty_unit(row["unit"]),
+        ]
+        for row in parameters
+    ]
+    return Table([Column("Parameter", "text"), *heads], rows)
+
+
+def _change_table(changes: Sequence[dict[str, Any]]) -> list[Part]:
+    """From window to window, how probable it is that each parameter rose."""
+    if not changes:
+        return []
+    names = list(changes[0]["probability"])
+    heads = [
+        Column("From the window that ends at", "text"),
+        Column("To that at"),
+        *(Column(words(name)) for name in names),
+    ]
+    rows = [
+        [
+            f"{digits(one['from_s'], 3)} s",
+            f"{digits(one['to_s'], 3)} s",
+            *(f"{p:.3f}" for p in one["probability"].values()),
+        ]
+        for one in changes
+    ]
+    remark = (
+        "The probability that each parameter is greater in the later window, from each to the next that can be "
+        "trusted; they share no samples. Near one half nothing has changed that the data can tell, near zero or one it "
+        "has."
+    )
+    return [Table(heads, rows, remark=remark)]
