@@ -21,15 +21,12 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Most of the time goes into compiling: here without what takes the compiler long, as `numerics.compilation` does for
-# the estimates anyway, and without what is marked slow.
-LESS := --xla_cpu_use_fusion_emitters=false
 PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# Without the tests that are marked slow.
 test: lint
-	XLA_FLAGS="$(LESS) $$XLA_FLAGS" $(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow"
 
-# All tests, compiled as for a user.
 test-all: lint
 	$(PYTEST)
 
