@@ -16,7 +16,6 @@ from jaximp.types import Numbers, nearest
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-    from matplotlib.figure import Figure
 
 
 class Column(NamedTuple):
@@ -123,11 +122,10 @@ class Result:
         dataset: xr.Dataset = xarray.Dataset(variables, coords=times)
         return dataset
 
-    def plot(self) -> Figure:
-        """The figure that shows the result at a glance."""
+    def plot(self) -> Any:
+        """The figure that shows the result at a glance: a `Figure` of matplotlib's."""
         # The figures stand above the numbers: they register themselves for the kinds of result that they know.
-        figure: Figure = import_module("jaximp.plots.registry").figure_of(self)
-        return figure
+        return import_module("jaximp.plots.registry").figure_of(self)
 
 
 def _needed(library: str, method: str) -> Any:

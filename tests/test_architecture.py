@@ -14,8 +14,9 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "jaximp"
 
 PACKAGES = (
-    "types", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust", "identification",
-    "perturbation", "posterior", "design", "simulation", "jobs", "plots", "reports", "batch", "papers", "cli",
+    "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust",
+    "identification", "perturbation", "posterior", "design", "simulation", "jobs", "plots", "reports", "batch",
+    "papers", "cli",
 )  # fmt: skip
 """From the ground up: a package imports from those before it, and from itself."""
 

@@ -110,13 +110,15 @@ def density(make: Callable[[], Any], x: np.ndarray, name: str) -> Case:
 
 
 CASES = [
-    Case("least_squares", lambda x: jaximp.least_squares(x, Y), W, "W", still=nonzero),
-    Case("least_squares, noise", lambda y: jaximp.least_squares(W, y, noise=NOISE), Y, "y"),
-    Case("least_squares, weights", lambda w: jaximp.least_squares(W, Y, weights=w), 1 + Y**2, "the weights"),
+    Case("least_squares", lambda x: jaximp.least_squares.least_squares(x, Y), W, "W", still=nonzero),
+    Case("least_squares, noise", lambda y: jaximp.least_squares.least_squares(W, y, noise=NOISE), Y, "y"),
+    Case(
+        "least_squares, weights", lambda w: jaximp.least_squares.least_squares(W, Y, weights=w), 1 + Y**2, "the weights"
+    ),
     Case("sliding_least_squares", lambda x: jaximp.sliding_least_squares(x, Y, 8, 4), W, "W", still=nonzero),
     Case(
         "sliding_theta, from shared sums",
-        small_chunks(lambda x: jaximp.sliding_theta(x, Y, 8, 4)),
+        small_chunks(lambda x: jaximp.least_squares.sliding_theta(x, Y, 8, 4)),
         W,
         "W",
         still=nonzero,
@@ -160,10 +162,12 @@ CASES = [
     ),
     Case("endpoint_impedance", lambda x: endpoint_impedance(ARM, x, XI, D, K), ANGLES, "the angles"),
     Case("ellipse", ellipse, K[None], "the matrix", note="no derivative of a circle's orientation"),
-    Case("FourierSeries", lambda x: jaximp.FourierSeries(x[0], x[1], 0.1, 2.0)(T), MOTION[:2], "the coefficients"),
-    Case("MinimumJerk", lambda x: jaximp.MinimumJerk(x, 0.2)(T), MOTION[:3, 0], "the way points"),
-    Case("SixthOrder", lambda x: jaximp.SixthOrder(x[0], x[1], 0.4)(T), MOTION[:2], "both ends"),
-    Case("RaisedSine", lambda x: jaximp.RaisedSine(x, 0.2)(T), MOTION[0], "the amplitude"),
+    Case(
+        "FourierSeries", lambda x: jaximp.motion.FourierSeries(x[0], x[1], 0.1, 2.0)(T), MOTION[:2], "the coefficients"
+    ),
+    Case("MinimumJerk", lambda x: jaximp.motion.MinimumJerk(x, 0.2)(T), MOTION[:3, 0], "the way points"),
+    Case("SixthOrder", lambda x: jaximp.motion.SixthOrder(x[0], x[1], 0.4)(T), MOTION[:2], "both ends"),
+    Case("RaisedSine", lambda x: jaximp.motion.RaisedSine(x, 0.2)(T), MOTION[0], "the amplitude"),
     Case("residual_triangle", lambda x: residual_triangle(x[:, :2], x[:, 2:4], x[:, 4:]), TRIALS[0], "all samples"),
     Case("merge_triangles", merge_triangles, TRIALS[:, :6], "the triangles"),
     Case(
@@ -174,12 +178,12 @@ CASES = [
     ),
     Case(
         "fit_stiffness_linear",
-        lambda x: stiffness(jaximp.fit_stiffness_linear(x[..., :2], x[..., 2:4], x[..., 4:])),
+        lambda x: stiffness(jaximp.perturbation.fit_stiffness_linear(x[..., :2], x[..., 2:4], x[..., 4:])),
         np.concatenate([TRIALS[..., 2:4], TRIALS[..., :2], TRIALS[..., 4:]], axis=-1),
         "all samples",
     ),
     density(
-        lambda: linear_density(("a", "b"), ("1", "1"), jaximp.whiten(W, Y)),
+        lambda: linear_density(("a", "b"), ("1", "1"), jaximp.least_squares.whiten(W, Y)),
         np.array([1.1, 1.9, -2.0]),
         "linear_density",
     ),
@@ -205,7 +209,10 @@ CASES = [
         "simulate_rig",
         lambda x: (
             simulate_rig(
-                Rig(), jaximp.FourierSeries(np.array([3.0]), np.array([1.0]), 0.0, 0.5), 0.01, HumanLoad(stiffness=x[0])
+                Rig(),
+                jaximp.motion.FourierSeries(np.array([3.0]), np.array([1.0]), 0.0, 0.5),
+                0.01,
+                HumanLoad(stiffness=x[0]),
             ).torque
         ),
         np.array([1e-3]),
@@ -228,8 +235,8 @@ REFUSED: list[tuple[str, Callable[[jax.Array], Any], np.ndarray, str]] = [
         W,
         "reads when it needs: pass the whole recording to sliding_least_squares",
     ),
-    ("whiten", lambda x: jaximp.whiten(x, Y).W, W, "LAPACK's band matrices: whiten the rows before"),
-    ("fit_noise", lambda x: jaximp.fit_noise(x, Y).autocovariance, W, "as whiten"),
+    ("whiten", lambda x: jaximp.least_squares.whiten(x, Y).W, W, "LAPACK's band matrices: whiten the rows before"),
+    ("fit_noise", lambda x: jaximp.least_squares.fit_noise(x, Y).autocovariance, W, "as whiten"),
 ]
 """Functions that need numbers, and why."""
 

@@ -438,8 +438,7 @@ def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table
     several, job = [result.estimates[k] for result in results], task.job
     about = results[0].about
     assert about is not None
-    human = job.models(about.joints, about.sample_rate)[1]
-    table = estimates_table(several, human, job)
+    table = estimates_table(several, job)
     table = table.rename_columns({"condition": "condition_number"})
     which = pa.array(np.repeat(np.arange(len(results)), [len(one.start) for one in several]))
     metadata = [dict(result.item.metadata) for result in results]

@@ -48,7 +48,7 @@ from jaximp.batch.results import (
 from jaximp.jobs.job import Job
 from jaximp.least_squares.chunks import cores
 from jaximp.numerics.precision import require_float64
-from jaximp.plots.words import main_parameter
+from jaximp.plots.wording import main_parameter
 from jaximp.recordings.outputs import MARK
 from jaximp.trust.verdicts import TRUSTED
 from jaximp.types import nearest

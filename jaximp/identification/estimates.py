@@ -6,10 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.least_squares.window import SlidingFit, WindowFit
+from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval
+from jaximp.models.base import Joints, Model
+from jaximp.models.joint import HumanJoint, parameter_units
+from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import Verdicts, worst
 from jaximp.trust.windows import Windows, judge_windows
@@ -36,9 +40,34 @@ class Reflex:
 
 
 @dataclass(frozen=True)
-class Estimates:
-    """One model in all windows of one recording."""
+class HumanPart:
+    """One human joint among the parameters of an `Estimates`."""
 
+    model: HumanJoint
+    theta: NDArray[np.float64]
+    """(M, k) the joint's own parameters."""
+    columns: slice
+    """Where they stand among all parameters."""
+    prefix: str
+    """What their names begin with where there are several joints."""
+    position_unit: str
+
+    def equilibrium(self) -> NDArray[np.float64]:
+        """(M,) position at which the elastic torque vanishes."""
+        return np.asarray(self.model.equilibrium(self.theta))
+
+    @property
+    def factor(self) -> NDArray[np.float64]:
+        """(k,) what takes each parameter from the motor's to the joint's side of the gear."""
+        return np.asarray(self.model.at_joint(jnp.ones(self.theta.shape[1])))
+
+
+@dataclass(frozen=True)
+class Estimates(Result):
+    """One model in all windows of one recording: M estimates of p parameters."""
+
+    model: Model
+    """What was identified."""
     names: tuple[str, ...]
     units: tuple[str, ...]
     window: float
@@ -74,6 +103,88 @@ class Estimates:
     """What a reader must know of these numbers, in plain words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
+
+    @property
+    def value(self) -> NDArray[np.float64]:
+        """(M, p) estimates."""
+        return np.asarray(self.fit.theta)
+
+    @property
+    def stderr(self) -> NDArray[np.float64]:
+        """(M, p) standard errors."""
+        return np.asarray(self.fit.stderr)
+
+    @property
+    def dof(self) -> NDArray[np.float64]:
+        """(M,) degrees of freedom of the standard errors."""
+        return np.asarray(self.fit.dof)
+
+    @property
+    def covariance(self) -> None:
+        """Windows keep none: one for each of them would fill the memory."""
+        return None
+
+    def interval(self, level: float = 0.95) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(M, p) lower and upper ends of the intervals that hold the truth with probability `level`."""
+        return confidence_interval(self.value, self.stderr, self.dof, level)
+
+    @property
+    def trusted(self) -> NDArray[np.bool_]:
+        """(M,) which windows break no rule."""
+        return self.verdicts.trusted
+
+    @property
+    def human_joints(self) -> list[HumanPart]:
+        """The human joints among the parameters."""
+        parts, first = [], 0
+        for model in self.model.models if isinstance(self.model, Joints) else (self.model,):
+            if isinstance(model, HumanJoint):
+                columns = slice(first, first + len(model.names))
+                prefix = self.names[first].removesuffix(model.names[0])
+                unit = "rad" if "rad" in model.units[model.names.index("stiffness")] else "m"
+                parts.append(HumanPart(model, self.value[:, columns], columns, prefix, unit))
+            first += len(model.names)
+        return parts
+
+    @property
+    def torque_unit(self) -> str:
+        """`N m` of revolute joints, `N` of prismatic ones, `mixed` of both."""
+        prismatic = set(parameter_units("prismatic").values())
+        units = {
+            "N" if set(part.units) <= prismatic else "N m"
+            for part in (self.model.models if isinstance(self.model, Joints) else (self.model,))
+        }
+        return units.pop() if len(units) == 1 else "mixed"
+
+    def columns(self) -> list[Column]:
+        """A row for each window: as in `estimates.parquet`."""
+        fit = self.fit
+        columns = [Column("start_s", "s", self.start), Column("end_s", "s", self.end)]
+        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            columns += [Column(name, unit, self.value[:, k]), Column(f"{name}_stderr", unit, self.stderr[:, k])]
+        columns += [
+            Column(f"{part.prefix}equilibrium", part.position_unit, part.equilibrium())
+            for part in self.human_joints
+            if part.model.offset
+        ]
+        for reflex in self.reflexes:
+            columns += [
+                Column(f"{reflex.name}_gain", reflex.unit, reflex.gain),
+                Column(f"{reflex.name}_gain_stderr", reflex.unit, reflex.gain_stderr),
+                Column(f"{reflex.name}_delay", "s", reflex.delay),
+            ]
+        return [
+            *columns,
+            Column("condition", "1", fit.cond),
+            Column("sigma_min", "mixed", fit.sigma_min),
+            Column("residual_rms", self.torque_unit, fit.residual_rms),
+            Column("vaf", "1", fit.vaf),
+            Column("held_out_vaf", "1", self.held_out_vaf),
+            Column("dof", "1", fit.dof),
+            Column("samples", "1", fit.samples),
+            Column("verdict", "", self.verdicts.verdict),
+            Column("reason", "", self.verdicts.reason),
+        ]
 
     @cached_property
     def verdicts(self) -> Verdicts:

@@ -294,6 +294,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
     thresholds = [part.threshold for part in parts if part.threshold is not None]
     return replace(
         parts[0],
+        model=model,
         names=model.names,
         units=model.units,
         fit=fit,
@@ -430,6 +431,7 @@ def _estimates(
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
     estimates = Estimates(
+        model=model,
         names=model.names,
         units=model.units,
         window=pipeline.window.length,

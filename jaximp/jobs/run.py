@@ -17,11 +17,15 @@ from jaximp.posterior.samplers import sample_posterior
 from jaximp.types import Progress, Recording
 
 
-def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates]:
-    """Run a job: one `Estimates` per method (a job without a robot beside the human has one).
+def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates] | TrialsResult:
+    """Run a job: a sequence of results, one per method (a job without a robot beside the human has one).
+
+    **Returns:** `Estimates` of a recording's windows, or, of a job with `[trials]`, what `identify_trials` does.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
+    if job.trials is not None:
+        return identify_trials(job, progress)
     return identify_recording(job, job.load(), job.load_robot_alone(), progress)
 
 

@@ -41,6 +41,16 @@ class TrialsResult:
     def main(self) -> ArmImpedance:
         return self.estimates[0]
 
+    def __len__(self) -> int:
+        return len(self.estimates)
+
+    def __getitem__(self, k: int) -> ArmImpedance:
+        """By the k-th method."""
+        return self.estimates[k]
+
+    def __iter__(self) -> Iterator[ArmImpedance]:
+        return iter(self.estimates)
+
 
 def identify_trials(job: Job, progress: Progress = lambda share: None) -> TrialsResult:
     """Run a job with `[trials]`. It writes no files.

@@ -251,7 +251,7 @@ def _given(
     return _Given(*arrays, window, step, window_starts(len(arrays[0]), window, step))
 
 
-def _in_chunks(given: _Given, noise: Array | None = None, statistics: bool = True) -> Any:
+def _in_chunks(given: _Given, noise: AnyArray | None = None, statistics: bool = True) -> Any:
     """Many windows, from sums that they share; None where they are few, or the noise does not allow that."""
     W, y, scale, window, step, starts = given
     n, n_windows = math.prod(y.shape[1:]), len(starts)

@@ -14,6 +14,7 @@ from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
 from jaximp.perturbation.isolation.isolated import Impedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF, SYMMETRIC_ELEMENTS, symmetric_matrix
+from jaximp.results import Result
 from jaximp.types import AnyArray, Numbers
 
 
@@ -56,7 +57,7 @@ class Curves:
 
 
 @dataclass(frozen=True)
-class ArmEstimate:
+class ArmEstimate(Result):
     """Damping and stiffness of an arm's joints by one method."""
 
     method: str
@@ -99,6 +100,11 @@ class ArmEstimate:
     @property
     def units(self) -> tuple[str, ...]:
         return tuple(MATRICES[MATRIX_OF[name]] for name in self.names)
+
+    @property
+    def value(self) -> Numbers:
+        """(p,) `theta`."""
+        return self.theta
 
     @property
     def D(self) -> Numbers:

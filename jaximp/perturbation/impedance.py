@@ -8,13 +8,16 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Num
 
+from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.deviations import Deviations, KnownArm
 from jaximp.perturbation.estimate import ArmEstimate, Curves, Evidence
 from jaximp.perturbation.fit import as_given, fit_deviations, with_torques
 from jaximp.perturbation.isolation.methods import METHODS, isolate
 from jaximp.perturbation.rules import judge, warnings_of
 from jaximp.perturbation.sensors import handle_disagreement
+from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials, in_window
+from jaximp.results import Column
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import TRUSTED, Verdict
 from jaximp.types import AnyArray, Numbers
@@ -49,6 +52,34 @@ class ArmImpedance(ArmEstimate):
     @property
     def trusted(self) -> bool:
         return self.verdict == TRUSTED
+
+    def columns(self) -> list[Column]:
+        """One row: as the method's in `estimates.parquet`, whatever symmetry it assumes."""
+        columns = [
+            Column("method", "", self.method),
+            Column("window_s", "s", self.window),
+            Column("trials", "1", self.trials),
+        ]
+        for name in sorted(ELEMENTS):
+            k = self.names.index(name if name in self.names else "stiffness_12")
+            unit = MATRICES[MATRIX_OF[name]]
+            columns += [Column(name, unit, self.theta[k]), Column(f"{name}_stderr", unit, self.stderr[k])]
+        for name in BASE_INERTIA:
+            columns += [
+                Column(name, "kg m^2", self.inertia[name]),
+                Column(f"{name}_stderr", "kg m^2", self.inertia_stderr[name]),
+            ]
+        return [
+            *columns,
+            Column("unperturbed", "1", self.unperturbed),
+            Column("delay_s", "s", np.nan if self.own is None else float(self.own.delay)),
+            Column("misfit", "1", np.nan if self.misfit is None else self.misfit),
+            Column("dof", "1", self.dof),
+            Column("vaf", "1", self.vaf),
+            Column("held_out_vaf", "1", self.held_out_vaf),
+            Column("verdict", "", self.verdict),
+            Column("reason", "", self.reason),
+        ]
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:

@@ -22,9 +22,9 @@ from .registry import figure_of as figure_of
 from .style import Panel as Panel
 from .style import curves as curves
 from .style import png as png
-from .words import main_parameter as main_parameter
-from .words import number as number
-from .words import percent as percent
-from .words import pretty_unit as pretty_unit
-from .words import with_unit as with_unit
-from .words import words as words
+from .wording import main_parameter as main_parameter
+from .wording import number as number
+from .wording import percent as percent
+from .wording import pretty_unit as pretty_unit
+from .wording import with_unit as with_unit
+from .wording import words as words

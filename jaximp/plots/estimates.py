@@ -36,7 +36,7 @@ from jaximp.plots.style import (
     remark,
     styled,
 )
-from jaximp.plots.words import main_parameter, number, pretty_unit, with_unit
+from jaximp.plots.wording import main_parameter, number, pretty_unit, with_unit
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
 from jaximp.types import AnyArray
 

@@ -15,7 +15,7 @@ from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
 from jaximp.perturbation.trials import VOLUNTARY_DELAY
 from jaximp.perturbation.windows import OtherWindows
 from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, styled
-from jaximp.plots.words import pretty_unit
+from jaximp.plots.wording import pretty_unit
 from jaximp.types import Numbers
 
 SHOWN = 4

@@ -65,7 +65,7 @@ from jaximp.plots.style import (
     decade_limits,
     envelope,
 )
-from jaximp.plots.words import number, pretty_unit, with_unit, words
+from jaximp.plots.wording import number, pretty_unit, with_unit, words
 from jaximp.trust.verdicts import NO_DATA, TRUSTED
 from jaximp.types import AnyArray, Numbers
 

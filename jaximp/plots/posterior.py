@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from jaximp.plots.style import BLACK, BLUE, VERMILLION, WIDTH, cycle, draw_band, draw_line, styled
 from jaximp.plots.style import LINES as STYLES
-from jaximp.plots.words import pretty_unit, words
+from jaximp.plots.wording import pretty_unit, words
 from jaximp.posterior.draws import Posterior, PosteriorMany, index_of
 from jaximp.types import AnyArray, Numbers
 

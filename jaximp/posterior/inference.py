@@ -48,6 +48,7 @@ from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_poste
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
+from jaximp.results import Column, Result
 from jaximp.trust.verdicts import TRUSTED, Verdicts
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 
@@ -83,8 +84,11 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Inference:
-    """What a recording tells of the parameters, in draws."""
+class Inference(Result):
+    """What a recording tells of the parameters, in draws.
+
+    As a result it is that of the whole record: means and standard deviations of the draws, and credible intervals.
+    """
 
     whole: Posterior
     """Of the whole record, as if nothing changed in it."""
@@ -118,6 +122,65 @@ class Inference:
     bands: Numbers
     """(5, N, n) quantiles `LEVELS` of the torque that the whole record's posterior predicts."""
     notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,) of the parameters and of the noise; of a reflex its gain."""
+        return self.summarised[0].names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.summarised[0].units
+
+    @property
+    def value(self) -> Numbers:
+        """(p,) means of the whole record's draws."""
+        return self.summarised[0].mean
+
+    @property
+    def stderr(self) -> Numbers:
+        """(p,) standard deviations of the draws."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def covariance(self) -> Numbers:
+        """(p, p) of the draws."""
+        return self.summarised[0].covariance
+
+    @property
+    def dof(self) -> float:
+        """Intervals are quantiles of the draws: no distribution is assumed."""
+        return np.inf
+
+    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
+        """(p,) lower and upper ends of credible intervals, with equal probability on both sides."""
+        if not 0 < level < 1:
+            raise ValueError(f"level is {level}: it must lie between 0 and 1")
+        low, high = np.quantile(self.summarised[0].samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        return low, high
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the whole record's draws, see `why`."""
+        return not self.why
+
+    def columns(self) -> list[Column]:
+        """A row for each window: mean and standard deviation of the draws, verdict and reason."""
+        windows = self.summarised[1]
+        if windows is None:
+            return [Column("start_s", "s", self.start), Column("end_s", "s", self.end)]
+        samples, columns = windows.samples, [Column("start_s", "s", self.start), Column("end_s", "s", self.end)]
+        for k, (name, unit) in enumerate(zip(windows.names, windows.units, strict=True)):
+            columns += [
+                Column(name, unit, samples[..., k].mean(axis=1)),
+                Column(f"{name}_stderr", unit, samples[..., k].std(axis=1)),
+            ]
+        reasons = [self.reason(k) for k in range(len(self.end))]
+        return [
+            *columns,
+            Column("verdict", "", self.verdicts.verdict),
+            Column("reason", "", np.array(reasons)),
+        ]
 
     @property
     def why(self) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filters import design_filters
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
-from jaximp.models.base import Joints, Model
-from jaximp.models.joint import HumanJoint
-from jaximp.plots.words import main_parameter, number, percent, pretty_unit, words
+from jaximp.models.base import Model
+from jaximp.plots.wording import main_parameter, number, percent, pretty_unit, words
 from jaximp.reports.pages import (
     Alert,
     Column,
@@ -137,10 +136,9 @@ def write_results(
     lengths, or nothing.
     """
     folder = Path(folder)
-    human = job.models(recording.joints, recording.sample_rate)[1]
     for k, estimates in enumerate(estimates_list):
         name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
-        write_table(folder / f"{name}.parquet", estimates_table(estimates, human, job))
+        write_table(folder / f"{name}.parquet", estimates_table(estimates, job))
     content = summary(estimates_list, job, recording, lengths)
     write_page(folder, page(estimates_list, lengths, content), content)
 
@@ -311,12 +309,12 @@ def summary(
     The main method's results stand at the top level, those of further methods under `further_methods` and those of
     several window lengths under `window_lengths`, in the same form.
     """
-    robot, human = job.models(recording.joints, recording.sample_rate)
+    robot = job.models(recording.joints, recording.sample_rate)[0]
     main = estimates_list[0]
     content = {
-        **_result(main, human),
-        "further_methods": [_result(estimates, human) for estimates in estimates_list[1:]],
-        "window_lengths": [_result(estimates, human) for estimates in lengths],
+        **_result(main),
+        "further_methods": [_result(estimates) for estimates in estimates_list[1:]],
+        "window_lengths": [_result(estimates) for estimates in lengths],
         "robot": _robot(main, robot),
         "recording": {
             "name": recording.name,
@@ -335,96 +333,21 @@ def summary(
     return without_nan(content)
 
 
-def estimates_table(
-    estimates: Estimates | Sequence[Estimates], human_model: Model | None, job: Job | None = None
-) -> pa.Table:
+def estimates_table(estimates: Estimates | Sequence[Estimates], job: Job | None = None) -> pa.Table:
     """One row per window, of one recording or of several. A column's unit is its field's metadata `unit`; the job's
-    text is in the schema's.
-
-    **Arguments:** `human_model` adds the equilibrium position of every human joint with an offset.
-    """
+    text is in the schema's."""
     several = [estimates] if isinstance(estimates, Estimates) else estimates
-    each = [_columns_of(one, human_model) for one in several]
     columns = [
-        (same[0][0], same[0][1], np.concatenate([np.asarray(values) for _, _, values in same]))
-        for same in zip(*each, strict=True)
+        (same[0].name, same[0].unit, np.concatenate([np.asarray(column.values) for column in same]))
+        for same in zip(*(one.columns() for one in several), strict=True)
     ]
     return table_of(columns, "" if job is None else job.text)
 
 
-def _columns_of(estimates: Estimates, human_model: Model | None) -> list[tuple[str, str, Any]]:
-    """Name, unit and values of every column."""
-    fit = estimates.fit
-    theta, stderr = np.asarray(fit.theta), np.asarray(fit.stderr)
-    columns: list[tuple[str, str, Any]] = [("start_s", "s", estimates.start), ("end_s", "s", estimates.end)]
-    for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True)):
-        columns += [(name, unit, theta[:, k]), (f"{name}_stderr", unit, stderr[:, k])]
-    columns += [
-        (f"{part.prefix}equilibrium", part.position_unit, part.equilibrium())
-        for part in _human_parts(estimates, human_model)
-        if part.model.offset
-    ]
-    for reflex in estimates.reflexes:
-        columns += [
-            (f"{reflex.name}_gain", reflex.unit, reflex.gain),
-            (f"{reflex.name}_gain_stderr", reflex.unit, reflex.gain_stderr),
-            (f"{reflex.name}_delay", "s", reflex.delay),
-        ]
-    efforts = {plots.effort(estimates, joint)[1] for joint in range(estimates.torque.shape[1])}
-    columns += [
-        ("condition", "1", fit.cond),
-        ("sigma_min", "mixed", fit.sigma_min),
-        ("residual_rms", efforts.pop() if len(efforts) == 1 else "mixed", fit.residual_rms),
-        ("vaf", "1", fit.vaf),
-        ("held_out_vaf", "1", estimates.held_out_vaf),
-        ("dof", "1", fit.dof),
-        ("samples", "1", fit.samples),
-        ("verdict", "", estimates.verdicts.verdict),
-        ("reason", "", estimates.verdicts.reason),
-    ]
-    return columns
-
-
-@dataclass(frozen=True)
-class _HumanPart:
-    """One human joint among the parameters of an `Estimates`."""
-
-    model: HumanJoint
-    theta: NDArray[np.float64]
-    """(M, k) the joint's own parameters."""
-    columns: slice
-    """Where they stand among all parameters."""
-    prefix: str
-    """What their names begin with where there are several joints."""
-    position_unit: str
-
-    def equilibrium(self) -> NDArray[np.float64]:
-        """(M,) position at which the elastic torque vanishes."""
-        return np.asarray(self.model.equilibrium(self.theta))
-
-    @property
-    def factor(self) -> NDArray[np.float64]:
-        """(k,) what takes each parameter from the motor's to the joint's side of the gear."""
-        return np.asarray(self.model.at_joint(jnp.ones(self.theta.shape[1])))
-
-
-def _human_parts(estimates: Estimates, human: Model | None) -> list[_HumanPart]:
-    members = () if human is None else human.models if isinstance(human, Joints) else (human,)
-    parts, first = [], 0
-    for model in members:
-        if isinstance(model, HumanJoint):
-            columns = slice(first, first + len(model.names))
-            prefix = estimates.names[first].removesuffix(model.names[0])
-            unit = "rad" if "rad" in model.units[model.names.index("stiffness")] else "m"
-            parts.append(_HumanPart(model, np.asarray(estimates.fit.theta)[:, columns], columns, prefix, unit))
-        first += len(model.names)
-    return parts
-
-
-def _result(estimates: Estimates, human: Model | None) -> dict[str, Any]:
+def _result(estimates: Estimates) -> dict[str, Any]:
     """What one method (or one window length) found."""
     trusted, vaf = estimates.verdicts.trusted, np.asarray(estimates.fit.vaf)
-    parts = _human_parts(estimates, human)
+    parts = estimates.human_joints
     step = np.diff(estimates.start)
     return {
         "method": estimates.method,
@@ -452,7 +375,7 @@ def _result(estimates: Estimates, human: Model | None) -> dict[str, Any]:
     }
 
 
-def _at_joint(estimates: Estimates, parts: list[_HumanPart]) -> dict[str, Any] | None:
+def _at_joint(estimates: Estimates, parts: list[HumanPart]) -> dict[str, Any] | None:
     """The same parameters on the joint's side of the gear, where there is one."""
     if all(part.model.gear_ratio == 1 for part in parts):
         return None
@@ -501,7 +424,7 @@ def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | 
     }
 
 
-def _equilibria(parts: list[_HumanPart], trusted: NDArray[np.bool_], geared: bool) -> dict[str, dict[str, Any]]:
+def _equilibria(parts: list[HumanPart], trusted: NDArray[np.bool_], geared: bool) -> dict[str, dict[str, Any]]:
     """The equilibrium position of every joint with an offset: a quotient, so that its median is told and no error."""
     found = {}
     for part in parts:

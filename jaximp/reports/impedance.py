@@ -20,7 +20,7 @@ from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.isolation.output_error import MISFIT
 from jaximp.perturbation.stiffness import MATRICES, MATRIX_OF
-from jaximp.plots.words import number, percent, pretty_unit
+from jaximp.plots.wording import number, percent, pretty_unit
 from jaximp.reports.pages import (
     Alert,
     Column,
@@ -40,7 +40,6 @@ from jaximp.reports.pages import (
     write_table,
 )
 from jaximp.trust.verdicts import TRUSTED
-from jaximp.types import Numbers
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -255,37 +254,11 @@ def _in_plain_numbers(one: Ellipse) -> dict[str, float]:
 
 def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
     """One row per method. A column's unit is its field's metadata `unit`; the job's text is in the schema's."""
-    several = result.estimates
-    columns: list[tuple[str, str, Any]] = [
-        ("method", "", [one.method for one in several]),
-        ("window_s", "s", [one.window for one in several]),
-        ("trials", "1", [one.trials for one in several]),
-    ]
-    units = {name: unit for one in several for name, unit in zip(one.names, one.units, strict=True)}
-    for name, unit in sorted(units.items()):
-        for ending, values in (("", "theta"), ("_stderr", "stderr")):
-            columns.append((name + ending, unit, [_element(one, name, getattr(one, values)) for one in several]))
-    for name in BASE_INERTIA:
-        columns += [
-            (name, "kg m^2", [one.inertia[name] for one in several]),
-            (f"{name}_stderr", "kg m^2", [one.inertia_stderr[name] for one in several]),
-        ]
-    columns += [
-        ("unperturbed", "1", [one.unperturbed for one in several]),
-        ("delay_s", "s", [np.nan if one.own is None else float(one.own.delay) for one in several]),
-        ("misfit", "1", [np.nan if one.misfit is None else one.misfit for one in several]),
-        ("dof", "1", [one.dof for one in several]),
-        ("vaf", "1", [one.vaf for one in several]),
-        ("held_out_vaf", "1", [one.held_out_vaf for one in several]),
-        ("verdict", "", [one.verdict for one in several]),
-        ("reason", "", [one.reason for one in several]),
+    columns = [
+        (same[0].name, same[0].unit, [column.values for column in same])
+        for same in zip(*(one.columns() for one in result.estimates), strict=True)
     ]
     return table_of(columns, "" if job is None else job.text)
-
-
-def _element(found: ArmImpedance, name: str, values: Numbers) -> float:
-    """Where a method makes the stiffness symmetric, element 21 is element 12."""
-    return float(values[found.names.index(name if name in found.names else "stiffness_12")])
 
 
 def _result(found: ArmImpedance) -> dict[str, Any]:

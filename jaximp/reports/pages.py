@@ -23,7 +23,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from jaximp.plots.words import number, percent, pretty_unit, words
+from jaximp.plots.wording import number, percent, pretty_unit, words
 
 if TYPE_CHECKING:
     import pyarrow as pa

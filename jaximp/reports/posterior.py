@@ -12,7 +12,7 @@ from jaximp import plots
 from jaximp.jobs.job import Job
 from jaximp.jobs.run_trials import TrialsResult
 from jaximp.least_squares.noise import ATTENUATION
-from jaximp.plots.words import pretty_unit, words
+from jaximp.plots.wording import pretty_unit, words
 from jaximp.posterior.densities import stiffness_matrices
 from jaximp.posterior.draws import Posterior, summarise
 from jaximp.posterior.files import save_posterior
