@@ -81,9 +81,9 @@ def test_names_are_imported_from_the_file_that_holds_them(module: str) -> None:
 
 
 @every_module
-def test_only_plots_imports_matplotlib(module: str) -> None:
+def test_only_plots_imports_matplotlib_and_bokeh(module: str) -> None:
     if module.split(".")[0] != "plots":
-        assert not [name for name in imports(module) if name.split(".")[0] == "matplotlib"]
+        assert not [name for name in imports(module) if name.split(".")[0] in ("matplotlib", "bokeh")]
 
 
 @every_module

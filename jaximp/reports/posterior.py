@@ -49,9 +49,9 @@ TITLES = {
 }
 CAPTIONS = {
     "bands": "Median, and bands that hold 50 and 95 %, of windows that share no samples, each by itself.",
-    "torque": "The filtered torque in the middle of the record, and the band that should hold 95 % of it, by the "
-    "posterior of the whole record. Where the torque leaves it for long, the model lacks something, or a parameter has "
-    "changed.",
+    "torque": "The filtered torque (in print that of the middle of the record), and the band that should hold 95 % of "
+    "it, by the posterior of the whole record. Where the torque leaves it for long, the model lacks something, or a "
+    "parameter has changed.",
     "ellipses": "Bands that hold 50 and 95 % of the draws in every direction.",
     "corner": "Of every pair the regions of highest density that hold 50 and 95 %. Narrow slanting ones: the data tell "
     "a combination of the two, and neither well.",
