@@ -125,7 +125,7 @@ class Result:
     def plot(self) -> Any:
         """The figure that shows the result at a glance: a `Figure` of matplotlib's."""
         # The figures stand above the numbers: they register themselves for the kinds of result that they know.
-        return import_module("jaximp.plots.registry").figure_of(self)
+        return import_module(f"{__package__}.plots.registry").figure_of(self)
 
 
 def _needed(library: str, method: str) -> Any:
