@@ -49,7 +49,8 @@ from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score,
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
 from jaximp.results import Column, Result
-from jaximp.trust.verdicts import TRUSTED, Verdicts
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.verdicts import POOR, TRUSTED, UNCONVERGED, WEAK, Rule, Verdict, Verdicts, judge_one
 from jaximp.types import AnyArray, Numbers, Progress, Recording
 
 CONTRADICTION = 1e-3
@@ -182,23 +183,15 @@ class Inference(Result):
             Column("reason", "", np.array(reasons)),
         ]
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Of the whole record's draws, by `RULES`."""
+        return judge_one(RULES, self, TrustLimits())
+
     @property
     def why(self) -> str:
-        """Why the posterior of the whole record cannot be trusted; empty where it can.
-
-        Some window must be trusted by `identify`, and they must not contradict each other: the squares of their
-        differences from the common mean, in standard deviations, are those of chi-squared where nothing changes
-        (Cochran 1954). Noise that the residuals demand must not move the estimate (`noise.disagreement`).
-        """
-        whole = self.summarised[0]
-        if whole.why or self.windows is None:
-            return whole.why
-        if not self.verdicts.trusted.any():
-            k = len(self.verdicts.reason) // 2
-            return (
-                f"no window can be trusted; that in the middle: {self.verdicts.verdict[k]}, {self.verdicts.reason[k]}"
-            )
-        return self._contradiction() or self._shifted()
+        """Why the posterior of the whole record cannot be trusted; empty where it can."""
+        return self.verdict.in_words()
 
     @property
     def good(self) -> np.ndarray:
@@ -260,13 +253,19 @@ class Inference(Result):
         within = (self.torque >= self.bands[0]) & (self.torque <= self.bands[-1])
         return float(within[counted].mean())
 
-    def _contradiction(self) -> str:
+    @cached_property
+    def contradiction(self) -> tuple[str, float]:
+        """The parameter in which windows differ most, and how probable so large a difference is where nothing changes.
+
+        The squares of differences from the common mean, in standard deviations, are then those of chi-squared.
+
+        **Source:** Cochran 1954.
+        """
         from scipy.stats import chi2
 
-        if self.good.sum() < 2:
-            return ""
         windows = self.summarised[1]
-        assert windows is not None
+        if windows is None or self.good.sum() < 2:
+            return "", 1.0
         samples = windows.samples[self.good]
         mean, variance = samples.mean(axis=1), samples.var(axis=1)
         common = (mean / variance).sum(axis=0) / (1 / variance).sum(axis=0)
@@ -274,24 +273,58 @@ class Inference(Result):
         p = chi2.sf(squares, len(samples) - 1)
         told = [k for k, name in enumerate(windows.names) if not name.startswith("log_noise")]
         worst = min(told, key=lambda k: float(p[k]))
-        if p[worst] >= CONTRADICTION:
-            return ""
-        return (
-            f"the windows contradict each other in {windows.names[worst]} (p = {p[worst]:.1g}): it changes, or the "
-            "model lacks something, and the whole record's draws are those of an average; look at the windows"
-        )
+        return windows.names[worst], float(p[worst])
 
-    def _shifted(self) -> str:
+    @cached_property
+    def shifted(self) -> tuple[str, float, float]:
+        """The parameter that the noise which the residuals demand moves most, by how many standard errors of the move,
+        and how probable that is of noise (`noise.disagreement`)."""
         from scipy.stats import norm
 
         k = int(np.abs(self.shift).argmax())
-        p = 2 * norm.sf(np.abs(self.shift[k])) * len(self.shift)
-        if p >= CONTRADICTION:
-            return ""
-        return (
-            f"what the residuals have in common, taken for noise, moves {self.whole.names[k]} by "
-            f"{np.abs(self.shift[k]):.2g} standard errors: it is no noise, but something that the model lacks"
-        )
+        size = float(np.abs(self.shift[k]))
+        return self.whole.names[k], size, float(2 * norm.sf(size) * len(self.shift))
+
+
+def _untrusted_windows(found: Inference, limits: TrustLimits) -> str:
+    k = len(found.verdicts) // 2
+    return f"no window can be trusted; that in the middle: {found.verdicts.verdict[k]}, {found.verdicts.reason[k]}"
+
+
+RULES: tuple[Rule[Inference], ...] = (
+    Rule(
+        "draws that can be believed",
+        UNCONVERGED,
+        lambda found, limits: bool(found.summarised[0].why),
+        lambda found, limits: found.summarised[0].why,
+    ),
+    Rule(
+        "a window that can be trusted",
+        WEAK,
+        lambda found, limits: found.windows is not None and not found.verdicts.trusted.any(),
+        _untrusted_windows,
+    ),
+    Rule(
+        "windows that agree",
+        POOR,
+        lambda found, limits: found.windows is not None and found.contradiction[1] < CONTRADICTION,
+        lambda found, limits: (
+            f"the windows contradict each other in {found.contradiction[0]} (p = {found.contradiction[1]:.1g}): it "
+            "changes, or the model lacks something, and the whole record's draws are those of an average; look at the "
+            "windows"
+        ),
+    ),
+    Rule(
+        "noise that is noise",
+        POOR,
+        lambda found, limits: found.windows is not None and found.shifted[2] < CONTRADICTION,
+        lambda found, limits: (
+            f"what the residuals have in common, taken for noise, moves {found.shifted[0]} by {found.shifted[1]:.2g} "
+            "standard errors: it is no noise, but something that the model lacks"
+        ),
+    ),
+)
+"""What the draws of a whole record must be to be trusted."""
 
 
 def posterior_of(

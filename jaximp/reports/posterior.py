@@ -33,13 +33,12 @@ from jaximp.reports.pages import (
     without_nan,
     write_page,
 )
-from jaximp.trust.verdicts import TRUSTED
+from jaximp.trust.verdicts import TRUSTED, UNCONVERGED
 from jaximp.types import Numbers
 
 if TYPE_CHECKING:
     from jaximp.plots.interactive import Live
 
-UNCONVERGED = "draws not to be trusted"
 """What is said of a window that `identify` trusts, and whose draws have not converged."""
 TITLES = {
     "bands": "Parameters over time",

@@ -17,13 +17,15 @@ from jaximp.trust.limits import TrustLimits
 
 TRUSTED, WEAK, POOR, NO_DATA, FAKE = "trusted", "weak excitation", "poor fit", "no data", "fake change"
 VERDICTS = (TRUSTED, WEAK, FAKE, POOR, NO_DATA)
+UNCONVERGED = "draws not to be trusted"
+"""Of posteriors alone."""
 
 
 class Verdict(NamedTuple):
     """One plain word, and what is behind it."""
 
     label: str
-    """One of `VERDICTS`."""
+    """One of `VERDICTS`, or `UNCONVERGED`."""
     reason: str
     """Cause with its measured number; empty where the estimate is trusted."""
     remedy: str
