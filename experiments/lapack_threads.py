@@ -4,6 +4,9 @@ Every case is a process of its own on two cores: one thread, or four with a comp
 small matrices. A case is blocked where for half a minute no call ends and all threads sleep; on a slow machine some of
 them would be waiting for a processor instead. The result stands in results/lapack_threads.txt.
 
+No upstream report of this was found. Programs with Fourier transforms are known to block in a like way, a thread of the
+pool waiting for the pool: https://github.com/PyAutoLabs/PyAutoFit/issues/1530.
+
     python experiments/lapack_threads.py [seconds for each case]
 """
 
