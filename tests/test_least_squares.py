@@ -288,6 +288,17 @@ def test_confidence_interval_is_students(level: float) -> None:
     assert np.isnan(confidence_interval(theta[0], stderr[0], np.array(np.nan), level)[0]).all()
 
 
+def test_confidence_interval_of_a_fit_is_that_of_its_numbers() -> None:
+    fit = least_squares(*window())
+    for level in (0.5, 0.95):
+        expected = confidence_interval(fit.theta, fit.stderr, fit.dof, level)
+        np.testing.assert_array_equal(confidence_interval(fit, level), expected)
+    np.testing.assert_array_equal(confidence_interval(fit), expected)
+    np.testing.assert_array_equal(confidence_interval(fit, level=0.95), expected)
+    with pytest.raises(ValueError, match="the level is 95: it must be a probability"):
+        confidence_interval(fit, 95)
+
+
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(powers=st.lists(st.integers(-9, 9), min_size=4, max_size=4), torque=st.integers(-9, 9), seed=st.integers(0, 99))
 def test_units_do_not_matter(powers: list[int], torque: int, seed: int) -> None:

@@ -166,6 +166,11 @@ def test_a_fraction_of_a_sample_is_refused(arguments: tuple[float, ...]) -> None
         sliding_least_squares(*recording(), *arguments)  # type: ignore[arg-type]
 
 
+def test_seconds_without_a_sample_rate_are_told_what_is_missing(unchecked: None) -> None:
+    with pytest.raises(ValueError, match=r"window is 2\.0: .* pass sample_rate to give it in seconds"):
+        sliding_least_squares(*recording(), 2.0)
+
+
 @pytest.mark.parametrize("shape", [(299,), (300, 1), (300, 2), ()], ids=str)
 def test_a_mask_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="valid has shape"):

@@ -56,7 +56,7 @@ ANY_RATE = 1000.0
 """Of recordings that could not be read [Hz]: a model's names do not depend on it."""
 
 _one_at_a_time = Lock()
-"""What may use LAPACK or draws figures: two such programs at a time can block each other."""
+"""What may use LAPACK or draws figures: such programs can block each other (experiments/lapack_threads.py)."""
 
 
 class Interrupted(Exception):

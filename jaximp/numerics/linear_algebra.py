@@ -1,8 +1,10 @@
 """Linear algebra of one small matrix, to be `vmap`ped over thousands: no LAPACK, derivatives of every order.
 
 A batch of small LAPACK calls costs microseconds a matrix, where the same formula written out over whole arrays is
-SIMD; many matrices side by side on the last axis, at the highest speed, are `lanes`. (Whether programs that call LAPACK
-can also block each other: experiments/lapack_threads.py.)
+SIMD; many matrices side by side on the last axis, at the highest speed, are `lanes`. And compiled programs that call
+LAPACK can block each other for ever where several threads run them on few cores: with jax 0.10.2, four threads on two
+cores stop after a few calls where several decompositions are in one program, and after a thousand with QR alone
+(experiments/lapack_threads.py).
 """
 
 from __future__ import annotations

@@ -340,10 +340,3 @@ def _zero_phase_gain(sos: Sections) -> NDArray[np.float64]:
     decay = int(np.ceil(40 / -np.log(slowest))) if slowest < 1 else 1 << 20
     n = 1 << min(22, max(10, int(np.ceil(np.log2(4 * decay)))))
     return np.abs(freqz_sos(sos, worN=np.linspace(0, np.pi, n // 2 + 1))[1]) ** 2
-
-
-def __getattr__(name: str) -> object:
-    """Names that stood here before; to go as soon as nobody asks for them."""
-    from jaximp import signals
-
-    return getattr(signals, name)
