@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design.excitation import Limits
-from jaximp.identification.filters import FilterSettings
+from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.design import DesignSettings, EncoderSettings

@@ -38,7 +38,7 @@ from jaximp.identification.identify import (
     share_of_stack,
     solve_windows,
 )
-from jaximp.identification.windows import Solved, place_windows
+from jaximp.identification.solving import Solved, place_windows
 from jaximp.jobs.job import Job, parse_job, read_job
 from jaximp.jobs.run import identify_recording
 from jaximp.least_squares import sliding as windows
@@ -245,11 +245,11 @@ def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> Non
     code = (
         "import jax, sys; jax.config.update('jax_enable_x64', True)\n"
         "from jaximp.batch import run as batch; from jaximp.jobs import job\n"
-        "from jaximp.identification import windows\n"
-        "program, placed = windows._program, []\n"
+        "from jaximp.identification import solving\n"
+        "program, placed = solving._program, []\n"
         "def seen(*args):\n"
         "    found = program(*args); placed.append(found[0].theta.sharding.device_set); return found\n"
-        "windows._program = seen\n"
+        "solving._program = seen\n"
         "batch.run(job.read_job(sys.argv[1] + '/job.toml'), out=sys.argv[2], manifest=sys.argv[1] + '/study.csv')\n"
         "print(sorted(map(len, placed)))"
     )

@@ -20,7 +20,7 @@ from jaximp.cli import main as cli
 from jaximp.jobs.job import parse_job, read_job
 from jaximp.jobs.run_trials import identify_trials
 from jaximp.models import BASE_INERTIA, ArmGeometry, PlanarArm
-from jaximp.perturbation import fit
+from jaximp.perturbation import trial_fits as fit
 from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
 from jaximp.perturbation.estimate import ArmEstimate
 from jaximp.perturbation.impedance import ArmImpedance, identify_impedance
@@ -28,7 +28,7 @@ from jaximp.perturbation.isolation.isolated import Impedance, Isolated
 from jaximp.perturbation.isolation.methods import METHODS, Method
 from jaximp.perturbation.sensors import handle_disagreement
 from jaximp.perturbation.trials import Handle, Trials
-from jaximp.perturbation.windows import at_other_windows
+from jaximp.perturbation.window_lengths import at_other_windows
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK
 

@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete, lfilter
 from jaximp.design import excitation
 from jaximp.identification import FilterSettings
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.filters import Filters
+from jaximp.identification.filter_settings import Filters
 from jaximp.identification.identify import in_windows, prepare
 from jaximp.identification.regression import measure, regress, undisturbed
 from jaximp.jobs import Job, parse_job

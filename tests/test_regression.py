@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.signal import sosfiltfilt
 
 from jaximp.identification import FilterSettings, WindowSettings
-from jaximp.identification.filters import Filters
+from jaximp.identification.filter_settings import Filters
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings
 from jaximp.models import Model

@@ -19,7 +19,7 @@ from jaximp.recordings.load import recording_from_arrays
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, VERDICTS, WEAK
-from jaximp.trust.windows import RULES, judge_windows, measure_windows
+from jaximp.trust.window_rules import RULES, judge_windows, measure_windows
 
 Numbers = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from jaximp.identification.windows import stack_size
+from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers import FORMATS, RecordingError, count_samples, delimiter_of

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from jaximp.batch.plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, printable, why_refused
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.filters import design_filters
+from jaximp.identification.filter_settings import design_filters
 from jaximp.identification.identify import Prepared, in_windows, prepare, share_of_stack, solve_windows
 from jaximp.identification.regression import Measured, measure, regress_stack
-from jaximp.identification.windows import LAGS_GRAIN
+from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model

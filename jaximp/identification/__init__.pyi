@@ -2,9 +2,9 @@ from .check import Finding as Finding
 from .check import Proposal as Proposal
 from .check import check_recording as check_recording
 from .estimates import Estimates as Estimates
-from .filters import Filters as Filters
-from .filters import FilterSettings as FilterSettings
-from .filters import design_filters as design_filters
+from .filter_settings import Filters as Filters
+from .filter_settings import FilterSettings as FilterSettings
+from .filter_settings import design_filters as design_filters
 from .identify import Prepared as Prepared
 from .identify import at_other_lengths as at_other_lengths
 from .identify import estimate as estimate

@@ -15,7 +15,7 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine
 from jaximp.trust.verdicts import NO_DATA, WEAK
-from jaximp.trust.windows import POSITIVE_INERTIA
+from jaximp.trust.window_rules import POSITIVE_INERTIA
 from jaximp.types import Progress, Recording
 
 GOOD, LOOK, BAD = "ok", "look", "bad"

@@ -16,7 +16,7 @@ from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import Verdicts, worst
-from jaximp.trust.windows import Windows, judge_windows
+from jaximp.trust.window_rules import Windows, judge_windows
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class Estimates(Result):
 
     @cached_property
     def verdicts(self) -> Verdicts:
-        """Made by the rules (`trust.windows.RULES`), and by nothing else; a window is as good as its worst joint."""
+        """Made by `trust.window_rules.RULES` and by nothing else; a window is as good as its worst joint."""
         each = [judge_windows(windows, self.limits) for windows in self.measured]
         return each[0] if len(each) == 1 else worst(each, [f"joint {j + 1}: " for j in range(len(each))])
 

@@ -20,7 +20,7 @@ from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, measure, once, regress, rows_of
 from jaximp.identification.separation import METHODS, Regression, Separation, fit_robot, separate
-from jaximp.identification.windows import (
+from jaximp.identification.solving import (
     MOST_ROWS,
     Placement,
     Solved,
@@ -33,7 +33,7 @@ from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.criteria import fake_change_threshold
-from jaximp.trust.windows import measure_windows
+from jaximp.trust.window_rules import measure_windows
 from jaximp.types import Progress, Recording, nearest
 
 CLEAR = 2.0

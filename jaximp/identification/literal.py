@@ -17,7 +17,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
-from jaximp.identification.filters import Filters, FilterSettings
+from jaximp.identification.filter_settings import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows, measured_motion, undisturbed
 from jaximp.least_squares.chunks import cores

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximp import signals
-from jaximp.identification.filters import Filters, FilterSettings, design_filters
+from jaximp.identification.filter_settings import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries

@@ -27,7 +27,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp import signals
-from jaximp.identification.filters import Filters, FilterSettings
+from jaximp.identification.filter_settings import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
 from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.design.files import read_trajectory
-from jaximp.identification.filters import FilterSettings
+from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials

@@ -16,7 +16,7 @@ from jaximp.perturbation.isolation.feedback_jerk import energy_spectra
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.static import StaticFit, static_inertia
 from jaximp.perturbation.trials import Trials
-from jaximp.perturbation.windows import OtherWindows, at_other_windows
+from jaximp.perturbation.window_lengths import OtherWindows, at_other_windows
 from jaximp.types import Numbers, Progress, nearest
 
 

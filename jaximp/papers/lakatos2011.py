@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.design.excitation import Limits
 from jaximp.design.perturbations import condition_of, design_perturbations
-from jaximp.identification.filters import FilterSettings, design_filters
+from jaximp.identification.filter_settings import FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm, rigid_body_torque
 from jaximp.motion.trajectories import MinimumJerk, SixthOrder, Trajectory, jerk
 from jaximp.perturbation.regression import TrialRows, fit_trials, joint_trials, predict_trials, regress_trials

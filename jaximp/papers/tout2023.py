@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaximp import plots
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.filters import FilterSettings
+from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.identify import estimate, noise_of, regress_pair
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.separation import fit_robot

@@ -11,11 +11,11 @@ from jaxtyping import Num
 from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.deviations import Deviations, KnownArm
 from jaximp.perturbation.estimate import ArmEstimate, Curves, Evidence
-from jaximp.perturbation.fit import as_given, fit_deviations, with_torques
 from jaximp.perturbation.isolation.methods import METHODS, isolate
 from jaximp.perturbation.rules import judge, warnings_of
 from jaximp.perturbation.sensors import handle_disagreement
 from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
+from jaximp.perturbation.trial_fits import as_given, fit_deviations, with_torques
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials, in_window
 from jaximp.results import Column
 from jaximp.trust.limits import TrustLimits

@@ -11,10 +11,10 @@ import numpy as np
 
 from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.estimate import ArmEstimate
-from jaximp.perturbation.fit import LATE, NOT_CONVERGED, NOT_FINITE
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.isolation.output_error import MISFIT, USUAL_STDERR
 from jaximp.perturbation.stiffness import FEWEST_TRIALS, MATRIX_OF
+from jaximp.perturbation.trial_fits import LATE, NOT_CONVERGED, NOT_FINITE
 from jaximp.perturbation.trials import window_warning
 from jaximp.trust.criteria import MatrixCriteria, impossible_body, matrix_criteria
 from jaximp.trust.limits import TrustLimits

@@ -13,7 +13,7 @@ from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.stiffness import ELEMENTS, MATRICES, MATRIX_OF
 from jaximp.perturbation.trials import VOLUNTARY_DELAY
-from jaximp.perturbation.windows import OtherWindows
+from jaximp.perturbation.window_lengths import OtherWindows
 from jaximp.plots.style import BLACK, BLUE, LINES, ORANGE, PALE, VERMILLION, WIDTH, draw_line, styled
 from jaximp.plots.wording import pretty_unit
 from jaximp.types import Numbers

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaximp.identification.identify import Prepared, in_windows, prepare
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.windows import Placement, place_windows
+from jaximp.identification.solving import Placement, place_windows
 from jaximp.least_squares.noise import (
     LAGS,
     Noise,

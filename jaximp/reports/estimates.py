@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaximp import plots
 from jaximp.identification.estimates import Estimates, HumanPart, Reflex
-from jaximp.identification.filters import design_filters
+from jaximp.identification.filter_settings import design_filters
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval

@@ -9,9 +9,9 @@ from jaxtyping import Num
 
 from jaximp.least_squares.window import confidence_interval
 from jaximp.perturbation.deviations import KnownArm
-from jaximp.perturbation.fit import BATCH, fit_windows, with_torques
 from jaximp.perturbation.isolation.methods import METHODS, isolate
 from jaximp.perturbation.stiffness import ELEMENTS, SYMMETRIC_ELEMENTS
+from jaximp.perturbation.trial_fits import BATCH, fit_windows, with_torques
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials
 from jaximp.types import AnyArray, Numbers
 

@@ -1,4 +1,4 @@
-"""Damping and stiffness from deviations of the joints, with what errors of the inertia add: eqs. (36) to (38).
+"""Standard errors of an arm: its damping and stiffness from all trials, from halves, and with another inertia.
 
 The fits of all trials, of both halves, and for an inertia that is one standard error larger go in one batch.
 """
