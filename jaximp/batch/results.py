@@ -271,7 +271,9 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
             result.recording, result.about = recording, About.of(recording)
             size = next((size for size in task.sizes if size[0] >= len(recording)), None)
             if batch.padded and size is not None:
-                found = measure(task.job.pipeline_for(recording), recording)
+                pipeline = task.job.pipeline_for(recording)
+                pipeline.check(recording)
+                found = measure(pipeline, recording)
                 result.stacked = (*size, _kind_of(found)), found
     result.seconds = time.perf_counter() - begin
     return result

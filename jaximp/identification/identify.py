@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
-from jaximp.identification.regression import Filtered, Measured, Rows, measure, once, regress, rows_of
+from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import METHODS, Regression, Separation, fit_robot, separate
 from jaximp.identification.solving import (
     MOST_ROWS,
@@ -117,11 +117,11 @@ def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = 
     """Filter a recording, and that of the robot alone where there is a pair."""
     if pipeline.robot is not None:
         return _prepare_pair(pipeline, pipeline.robot, recording, alone)
+    pipeline.check(recording)
     measured = measure(pipeline, recording)
-    rows, noise = regress(measured)
-    if not pipeline.once:
-        rows = regress_in_windows(pipeline, recording, pipeline.model)
-    return _prepared(measured, rows, noise)
+    if pipeline.once:
+        return _prepared(measured, *regress(measured))
+    return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
 
 
 def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
@@ -197,7 +197,7 @@ def in_windows(
 
 
 def _room(place: Placement) -> int | None:
-    return None if place.separate else place.room
+    return place.room if place.lengths else None
 
 
 def _by_methods(prepared: Prepared, pair: _Pair, place: Placement, progress: Progress, curves: bool) -> list[Estimates]:
@@ -237,7 +237,7 @@ def _joint_by_joint(
         one = _one_joint(prepared, model, *place)
         parts.append(in_windows(one, longest=longest, curves=curves)[0])
         progress(len(parts) / len(model.models))
-    return _side_by_side(model, parts)
+    return replace(_side_by_side(model, parts), limits=prepared.pipeline.limits)
 
 
 def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Prepared:
@@ -347,33 +347,31 @@ def at_other_lengths(
     return found
 
 
-def regress_pair(
-    pipeline: Pipeline, robot: Model, recording: Recording
-) -> tuple[Regression, Rows, NDArray[np.float64], Measured]:
-    """Rows of the robot's and of the human's model for one recording, apart and stacked, and the columns' noise."""
+def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:
+    """Rows of the robot's and of the human's model for one recording, apart and stacked."""
     both = robot + pipeline.model
     measured = measure(pipeline, recording, both)
-    rows, noise = regress(measured)
-    if not pipeline.once:
-        rows = regress_in_windows(pipeline, recording, both)
+    rows = regress(measured)[0] if pipeline.once else regress_in_windows(pipeline, recording, both)
     n = len(robot.names)
     W, torque = jnp.asarray(rows.W), jnp.asarray(rows.torque)
-    return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, noise, measured
+    return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, measured
 
 
 def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone: Recording | None) -> Prepared:
+    pipeline.check(recording)
     alone = _checked_pair(recording, alone)
     # The robot's own parameters come from its whole recording, which needs no windows.
     whole_record = once(pipeline)
     whole = regress_pair(whole_record, robot, alone)[0]
-    noise = noise_of(whole_record)
-    robot_fit = fit_robot(whole, None if noise is None else jnp.asarray(noise))
+    known = noise_of(whole_record)
+    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known))
     # Methods 1 and 2 need no windows of the robot alone.
     shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
     in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
-    loaded, rows, column_noise, measured = regress_pair(pipeline, robot, recording)
+    loaded, rows, measured = regress_pair(pipeline, robot, recording)
+    noise = column_noise(measured) if rows.noisy is None else np.sqrt((rows.noisy**2).mean(axis=0))
     pair = _Pair(robot, robot_fit, in_windows, loaded)
-    return _prepared(measured, rows, column_noise[len(robot.names) :], pair)
+    return _prepared(measured, rows, noise[len(robot.names) :], pair)
 
 
 def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:

@@ -94,7 +94,8 @@ class Pipeline:
         return replace(self, window=replace(self.window, length=length, step=step))
 
     def check(self, recording: Recording) -> None:
-        """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees."""
+        """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees, and for
+        filters that its sample rate does not allow."""
         require_float64(recording.position)
         duration = len(recording) / recording.sample_rate
         if round(self.window.length * recording.sample_rate) > len(recording):
@@ -102,11 +103,17 @@ class Pipeline:
                 f"the window of {self.window.length:g} s is longer than the recording of {duration:.4g} s: "
                 "shorten window.length"
             )
-        self._check_memory(recording)
+        self.check_memory(recording)
+        if abs(self.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+            raise ValueError(
+                f"the pipeline is for {self.sample_rate:g} Hz, but the recording has {recording.sample_rate:g} Hz: "
+                "make one for its sample rate"
+            )
+        design_filters(self.filter, self.sample_rate)
         if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
             _check_elbow(recording)
 
-    def _check_memory(self, recording: Recording) -> None:
+    def check_memory(self, recording: Recording) -> None:
         """A model with memory must see the past, and know how many samples it is."""
         if self.model.sample_rate is None:
             return

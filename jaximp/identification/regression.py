@@ -31,6 +31,7 @@ from jaximp.identification.filter_settings import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
 from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled
+from jaximp.numerics.precision import require_float64
 from jaximp.types import AnyArray, Recording
 
 T = TypeVar("T")
@@ -87,11 +88,13 @@ class Measured:
 
 
 def measure(pipeline: Pipeline, recording: Recording, model: Model | None = None) -> Measured:
-    """Check a recording and look for its gaps, jumps and noise; by default for the model that is identified.
+    """Look for a recording's gaps, jumps and noise; by default for the model that is identified.
 
-    **Raises:** `ValueError` for a recording that does not suit the pipeline.
+    **Raises:** `ValueError` for a recording that is too short for the filters, or of another sample rate than a model
+    with memory. Whether its windows fit is another question (`Pipeline.check`).
     """
-    pipeline.check(recording)
+    require_float64(recording.position)
+    pipeline.check_memory(recording)
     model, filters = pipeline.model if model is None else model, pipeline.filters
     for sos in (filters.position, filters.parallel):
         if sos is not None:
@@ -106,8 +109,12 @@ def measure(pipeline: Pipeline, recording: Recording, model: Model | None = None
 
 def regress(measured: Measured) -> tuple[Rows, NDArray[np.float64]]:
     """Rows of one recording, and root mean square (p,) of what noise of the position leaves in every column."""
-    found = regress_stack([measured], len(measured.recording), 1)
-    return rows_of(measured, found, 0)
+    return rows_of(measured, regress_stack([measured], len(measured.recording), 1), 0)
+
+
+def column_noise(measured: Measured) -> NDArray[np.float64]:
+    """(p,) root mean square of what noise of the position leaves in every column."""
+    return _noise_of(measured, regress_stack([measured], len(measured.recording), 1), 0)[1]
 
 
 class Filtered(eqx.Module):
@@ -147,7 +154,7 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
     recording, pipeline = measured.recording, measured.pipeline
     decimate = pipeline.filters.decimate
     n = -(-len(recording) // decimate)
-    W, y, speed, noisy = (x[k][:n] for x in (found.W, found.y, found.speed, found.noisy))
+    W, y, speed = (x[k][:n] for x in (found.W, found.y, found.speed))
     clean, moving = measured.clean[::decimate], speed >= pipeline.window.min_velocity
     valid = clean & moving if recording.n_joints == 1 else clean[:, None] & moving
     if not valid.any():
@@ -156,9 +163,15 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
             "too short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
             "window.min_velocity"
         )
-    noisy = without_jumps(measured.model, noisy)
-    level = np.sqrt((noisy.reshape(-1, noisy.shape[-1]) ** 2).mean(axis=0))
+    noisy, level = _noise_of(measured, found, k)
     return Rows(W, y, valid, recording.time[::decimate], noisy), level
+
+
+def _noise_of(measured: Measured, found: Filtered, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What noise of the position leaves in every column (N, *n, p), and its root mean square (p,)."""
+    n = -(-len(measured.recording) // measured.pipeline.filters.decimate)
+    noisy = without_jumps(measured.model, found.noisy[k][:n])
+    return noisy, np.sqrt((noisy.reshape(-1, noisy.shape[-1]) ** 2).mean(axis=0))
 
 
 def _stacked(several: Sequence[Measured], padded: int) -> _Stack:
@@ -179,7 +192,7 @@ def _stacked(several: Sequence[Measured], padded: int) -> _Stack:
         motion=tuple(together(x) for x in zip(*(one.motion for one in several), strict=True)),
         noisy=tuple(together(x) for x in zip(*(one.noisy for one in several), strict=True)),
         samples=np.array([len(one.recording) for one in several]),
-        sample_rate=np.array([one.pipeline.sample_rate for one in several]),
+        sample_rate=np.array([one.recording.sample_rate for one in several]),
         position=filters("position"),
         parallel=filters("parallel"),
     )

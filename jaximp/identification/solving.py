@@ -25,15 +25,18 @@ from jaximp.identification.regression import Rows, first_call, on_every_device
 from jaximp.least_squares.chunks import LONGEST_REACH, Task, finish
 from jaximp.least_squares.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, solve_chunk
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares, window_starts
-from jaximp.least_squares.window import SlidingFit, variance_accounted_for
+from jaximp.least_squares.window import SlidingFit, check_finite, variance_accounted_for
 from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray
 
 MOST_ROWS = 400_000
 """Rows of a recording that goes through in one piece; longer ones are cut into chunks."""
-MOST_SAMPLES = 400_000
+STACKED_SAMPLES = 400_000
 """Samples of a stack, padded ones too: its filtered columns take some hundred times as many bytes."""
 MOST_IN_STACK = 128
+"""Recordings."""
+MOST_EMPTY = 4
+"""So many times the rows that there are, sums that windows share may look at."""
 CALL = 4
 """What a call of a program costs, in recordings."""
 LAGS_GRAIN = 16
@@ -131,10 +134,11 @@ class Layout(NamedTuple):
     """Lags of the noise's autocovariance, zero for white noise."""
 
 
-def make_layout(rows: int, outputs: int, parameters: int, place: Placement, lags: int) -> Layout:
+def make_layout(rows: int, outputs: int, place: Placement, lags: int) -> Layout:
     """The program for so many padded rows, and windows of up to `place.room` rows."""
-    window, step, reach = place.window * outputs, place.step * outputs, (lags - 1) * outputs
+    window, step = place.window * outputs, place.step * outputs
     lags = -(-lags // LAGS_GRAIN) * LAGS_GRAIN
+    reach = (lags - 1) * outputs
     if lags and (reach > LONGEST_REACH or 2 * reach > window):
         return Layout(None, place.window, place.step, lags)
     per_block = max(1, min(BLOCK // step, window // step))
@@ -143,6 +147,8 @@ def make_layout(rows: int, outputs: int, parameters: int, place: Placement, lags
     room = -(-place.room * outputs // (step * per_block))
     predicts = place.window % place.step == 0
     plan = Plan(step, per_block, lanes, room, outputs, True, False, lags, predicts)
+    if plan.rows > MOST_EMPTY * rows * outputs:  # few windows, far apart: each by itself is cheaper
+        return Layout(None, place.window, place.step, lags)
     return Layout(plan, 0 if predicts and place.lengths else place.window, place.step, lags)
 
 
@@ -168,10 +174,12 @@ def solve_stack(
     **Arguments:** `noise` of each, by lag in rows; `place` of the first, whose window, step and room are those of all;
     `padded` rows to which each is filled up; a stack that is not full is filled with copies of the first.
     """
+    for rows in several:
+        check_finite(rows.W, rows.torque, rows.valid)
     first = several[0]
     lags = 0 if noise[0] is None else max(len(x) for x in noise if x is not None)
     outputs = int(np.prod(first.torque.shape[1:]))
-    layout = make_layout(padded, outputs, first.W.shape[-1], place, lags)
+    layout = make_layout(padded, outputs, place, lags)
     stack = _stacked(several, noise, place, layout, padded, stacked)
     with first_call("solve", layout, *(x.shape for x in jax.tree.leaves(stack))):
         found = jax.tree.map(np.asarray, _program(layout, stack))
@@ -271,5 +279,5 @@ def _predicted(rows: Rows, theta: NDArray[np.float64], start: int, window: int) 
 
 def stack_size(padded: int, count: int) -> int:
     """How many of `count` recordings of so many samples are stacked: a power of two; empty places and calls cost."""
-    most = max(1, min(MOST_IN_STACK, MOST_SAMPLES // padded)).bit_length()
+    most = max(1, min(MOST_IN_STACK, STACKED_SAMPLES // padded)).bit_length()
     return min((1 << k for k in range(most)), key=lambda size: -(-count // size) * (size + CALL))

@@ -1,4 +1,4 @@
-"""Least squares of all windows of a chunk of a recording: the mathematics of `windows.sliding_least_squares`.
+"""Least squares of all windows of a chunk of a recording: the mathematics of `sliding_least_squares`.
 
 Window k needs the sums over its rows of all products of two columns of `X = [W y]`: its Gram matrix. Neighbours share
 nearly all rows, so that the sums cost the same for every window length. The tricks, each named once:

@@ -307,7 +307,7 @@ RULES: tuple[Rule[Inference], ...] = (
     Rule(
         "windows that agree",
         POOR,
-        lambda found, limits: found.windows is not None and found.contradiction[1] < CONTRADICTION,
+        lambda found, limits: found.windows is not None and not found.contradiction[1] >= CONTRADICTION,
         lambda found, limits: (
             f"the windows contradict each other in {found.contradiction[0]} (p = {found.contradiction[1]:.1g}): it "
             "changes, or the model lacks something, and the whole record's draws are those of an average; look at the "
@@ -317,7 +317,7 @@ RULES: tuple[Rule[Inference], ...] = (
     Rule(
         "noise that is noise",
         POOR,
-        lambda found, limits: found.windows is not None and found.shifted[2] < CONTRADICTION,
+        lambda found, limits: found.windows is not None and not found.shifted[2] >= CONTRADICTION,
         lambda found, limits: (
             f"what the residuals have in common, taken for noise, moves {found.shifted[0]} by {found.shifted[1]:.2g} "
             "standard errors: it is no noise, but something that the model lacks"

@@ -107,7 +107,18 @@ def impossible_body(
     errors: float,
     covariance: Num[AnyArray, "M p p"] | None = None,
 ) -> NDArray[np.bool_]:
-    """(M,) whether an arm's base inertial parameters belong to no rigid body, by so many standard errors.
+    """(M,) whether an arm's base inertial parameters belong to no rigid body, by so many standard errors."""
+    return body_margin(names, theta, stderr, covariance) < -errors
+
+
+def body_margin(
+    names: Sequence[str],
+    theta: Num[AnyArray, "M p"],
+    stderr: Num[AnyArray, "M p"],
+    covariance: Num[AnyArray, "M p p"] | None = None,
+) -> Numbers:
+    """(M,) how far inside of what a rigid body can have an arm's base inertial parameters lie, in standard errors;
+    infinite for a model without them.
 
     With `inertia_1 = I_1 + m_2 l1^2 + I_2`, `inertia_2 = m_2 c_2 l1`, `inertia_3 = I_2`: the last is above zero, so is
     the second (a forearm lies beyond the elbow), and `(inertia_1 - inertia_3) inertia_3 > inertia_2^2`, without which
@@ -115,7 +126,7 @@ def impossible_body(
     """
     wanted = [f"inertia_{k}" for k in (1, 2, 3)]
     if not set(wanted) <= set(names):
-        return np.zeros(len(theta), bool)
+        return np.full(len(theta), np.inf)
     index = np.array([list(names).index(name) for name in wanted])
     (first, second, third), error = np.asarray(theta)[:, index].T, np.asarray(stderr)[:, index].T
     spread = _spread(stderr, covariance, index)
@@ -124,7 +135,7 @@ def impossible_body(
     margin_error = np.sqrt(np.einsum("mi,mij,mj->m", slope, spread, slope))
     with np.errstate(invalid="ignore"):
         found = np.stack([third / error[2], second / error[1], margin / margin_error])
-        return np.asarray((found < -errors).any(axis=0))
+    return np.asarray(np.where(np.isnan(found), np.inf, found).min(axis=0))
 
 
 def _spread(stderr: AnyArray, covariance: AnyArray | None, index: NDArray[np.int64]) -> Numbers:

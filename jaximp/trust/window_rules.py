@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Role
-from jaximp.trust.criteria import MatrixCriteria, impossible_body, matrix_criteria
+from jaximp.trust.criteria import USUAL, MatrixCriteria, body_margin, matrix_criteria
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, WEAK, Rule, Verdicts, judge_all
 from jaximp.types import Numbers, nearest
 
-USUAL = TrustLimits()
 POSITIVE_INERTIA = "an inertia above zero"
 """The rule that a wrong sign of the torque breaks."""
 MASSES = (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,)))
@@ -64,8 +63,8 @@ class Windows:
     """The same of the friction that is farthest below."""
     driving: Any
     """Which friction that is."""
-    no_body: Any
-    """Whether an arm's inertia is that of no rigid body, by `limits.errors_apart`."""
+    body_margin: Any
+    """How far inside of what a rigid body can have an arm's inertia lies, in standard errors."""
     stiffness: MatrixCriteria | None
     """Of an arm."""
     damping: MatrixCriteria | None
@@ -117,9 +116,7 @@ def measure_windows(
         below_zero = -theta / stderr
     judged = _judged(names, limits.parameters)[:, None]
     error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
-    mass = np.array(
-        [role in (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,))) for role in roles]
-    )
+    mass = np.array([role in MASSES for role in roles])
     friction = np.array([role.kind == "friction" for role in roles])
     negative_friction = np.where(friction[:, None], below_zero, -np.inf)
     named, called = np.asarray(names), [_element(role) for role in roles]
@@ -143,7 +140,7 @@ def measure_windows(
         negative_inertia=np.where(mass[:, None], below_zero, -np.inf).max(axis=0),
         negative_friction=negative_friction.max(axis=0),
         driving=named[negative_friction.argmax(axis=0)],
-        no_body=impossible_body(called, fit.theta, fit.stderr, limits.errors_apart),
+        body_margin=body_margin(called, fit.theta, fit.stderr),
         stiffness=stiffness,
         damping=damping,
     )
@@ -291,7 +288,7 @@ RULES: tuple[Rule[Windows], ...] = (
     Rule(
         "an inertia that a body can have",
         POOR,
-        lambda w, limits: w.no_body,
+        lambda w, limits: w.body_margin < -limits.errors_apart,
         lambda w, limits: "no rigid body has this inertia",
         lambda w, limits: "are the joints swapped, or the angles in other units?",
     ),
