@@ -123,6 +123,7 @@ def test_mass_matrix_is_positive_and_its_rate_less_twice_the_coriolis_matrix_ske
     assert (np.linalg.eigvalsh(mass) > 0).all()
 
 
+@pytest.mark.slow
 def test_matrix_functions_take_batches_of_any_shape_and_differentiate() -> None:
     (q, dq, ddq), xi = motion(6), BORNER.base_parameters()
     shaped = [x.reshape(2, 3, 2) for x in (q, dq, ddq)]

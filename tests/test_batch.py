@@ -192,6 +192,7 @@ def stacked(job: Job, recordings: list[Recording], padded: int, size: int) -> li
     return solve_windows([share_of_stack(one, found, k) for k, one in enumerate(measured)], rows, size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) -> None:
     recordings, old, new = CASES[case]
@@ -240,6 +241,7 @@ def test_one_window_as_long_as_the_recording() -> None:
     np.testing.assert_allclose(theta[0], expected, 1e-9)
 
 
+@pytest.mark.slow
 def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
     """Two devices, which XLA makes of one processor, give what one gives, and each has half of the recordings."""
     code = (
@@ -268,6 +270,7 @@ def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> Non
             np.testing.assert_allclose(found[name], expected[name], 1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
     """A thousand lengths are planned; of these a few dozen are run, at least one for each size."""
     compiled: list[str] = []
@@ -357,6 +360,7 @@ def test_every_reader_reads_it(study: Path, reader: str) -> None:
     assert {"S1", "S2", "../x", "..", "<script>alert(1)</script>", "1", "01", ""} == subjects
 
 
+@pytest.mark.slow
 def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
     """One by one, with the recording of the robot alone that the manifest names."""
     text = JOB.replace("human = true", "human = true\nrobot = { gravity = false, coulomb = false }\nmethods = [1, 3]")
@@ -390,6 +394,7 @@ def test_a_study_has_conditions_of_its_own(tmp_path: Path) -> None:
     assert {*table.column_names} - {"condition"} <= batch_results.reserved_columns(job)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_joints", [1, 2])
 def test_a_reflex_is_what_it_is_alone(tmp_path: Path, n_joints: int) -> None:
     """Recordings of two rates in one table, with gain and delay of every window and the gain in the row of each."""
@@ -589,6 +594,7 @@ FAULTS = [
 
 
 # The signal's exception that Python drops is what the test is about.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_nothing_is_lost_and_nothing_differs(
@@ -1036,6 +1042,7 @@ def test_a_folder_that_is_there_is_not_touched(study: Path, tmp_path: Path) -> N
 # --- workers ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     import psutil
@@ -1058,6 +1065,7 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: 
     assert json.loads((tmp_path / "out/quarantine.json").read_text()) == []
 
 
+@pytest.mark.slow
 def test_somebodys_cluster_gives_the_same(study: Path, tmp_path: Path) -> None:
     """Workers that know nothing of us, but for where we are installed."""
     distributed = pytest.importorskip("distributed")

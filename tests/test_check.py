@@ -30,6 +30,7 @@ def test_delay_is_found(samples: int) -> None:
     assert delay == pytest.approx(samples * 1e-3, abs=0.4e-3)
 
 
+@pytest.mark.slow
 def test_a_wrong_sign_is_named_and_never_trusted() -> None:
     recording = joint()
     wrong = replace(recording, torque=-recording.torque)
@@ -55,6 +56,7 @@ def test_bandwidth_ends_where_the_motion_ends() -> None:
     assert 6.0 < coherent_bandwidth(joint()) < 20.0
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_seen() -> None:
     recording = joint()
     clipped = np.clip(recording.torque, -4.0, None)

@@ -75,6 +75,7 @@ def test_windows_are_those_of_the_qr_decomposition(
         np.testing.assert_allclose(sliding_theta(W, y, window, step, valid=mask), expected.theta, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "window", "step", "p", "outputs", "lags"),
     [
@@ -94,6 +95,7 @@ def test_coloured_noise(n: int, window: int, step: int, p: int, outputs: tuple[i
         assert_same(fit, one_by_one(W, y, window, step, valid=mask, noise=noise), y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
 @pytest.mark.parametrize("noise", [None, 0.7 ** np.arange(9)], ids=["white", "coloured"])
 def test_weights(outputs: tuple[int, ...], noise: Numbers | None) -> None:
@@ -106,6 +108,7 @@ def test_weights(outputs: tuple[int, ...], noise: Numbers | None) -> None:
     assert_same(fit, one_by_one(W, y, 50, valid=valid, weights=weights, noise=noise), y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [None, 0.8 ** np.arange(9)], ids=["white", "coloured"])
 @pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
 def test_the_shortest_window_that_is_sure_enough(outputs: tuple[int, ...], noise: Numbers | None) -> None:
@@ -135,6 +138,7 @@ def test_the_shortest_window_that_is_sure_enough(outputs: tuple[int, ...], noise
             assert found[shorter].stderr[start + n - shorter, 1] > wanted[1]
 
 
+@pytest.mark.slow
 def test_shortest_windows_under_jit_and_where_the_motion_changes_in_kind() -> None:
     W, y = recording(1200, 2)
     W[500:] = 1e-4 * W[500:] @ np.array([[1.0, 0.5], [-0.2, 1.0]])
@@ -191,6 +195,7 @@ def test_a_stretch_that_determines_nothing_harms_no_other_window() -> None:
     assert_same(fit, one_by_one(W, y, 100), y)
 
 
+@pytest.mark.slow
 def test_inside_jit_vmap_and_grad() -> None:
     W, y = (np.stack(x) for x in zip(recording(500, seed=1), recording(500, seed=2), strict=True))
     W[0, 250:] *= 1e-6  # some windows here need a QR decomposition
@@ -207,6 +212,7 @@ def test_inside_jit_vmap_and_grad() -> None:
     assert float(slope) == pytest.approx((float(loss(1e-6)) - float(loss(-1e-6))) / 2e-6, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("traced", [False, True])
 def test_single_precision_stays_and_costs_no_more_than_its_rounding(traced: bool) -> None:
     """At condition 1000: the sums over 2000 rows lose next to nothing."""

@@ -101,6 +101,7 @@ def test_arms_that_cannot_be_simulated_are_refused(
     assert not (tmp_path / "arm").exists()
 
 
+@pytest.mark.slow
 def test_demo_finds_the_step(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     assert run("demo", "--out", tmp_path / "demo")[0] == 0
     table = pq.read_table(tmp_path / "demo" / "estimates.parquet").to_pydict()

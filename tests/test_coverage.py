@@ -4,10 +4,12 @@ import importlib.util
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 RECORDS = 400
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_and_the_textbooks_do_not() -> None:
     path = Path(__file__).parents[1] / "experiments" / "coverage.py"
     spec = importlib.util.spec_from_file_location("coverage_experiment", path)

@@ -71,6 +71,7 @@ def test_files_hold_the_same_motion(folder: Path) -> None:
     assert (folder / "trajectory.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_identify_takes_the_design_as_its_reference(folder: Path) -> None:
     series, rate = read_trajectory(folder / "trajectory.json"), 100.0
     time = np.arange(1500) / rate
@@ -125,6 +126,7 @@ def test_a_missing_job_file(tmp_path: Path) -> None:
         read_design_job(tmp_path / "none.toml")
 
 
+@pytest.mark.slow
 def test_the_human_in_a_known_robot() -> None:
     text = JOB.replace(
         "robot = { gear_ratio = 15 }", "robot = { gear_ratio = 15 }\nhuman = { gear_ratio = 15, offset = false }"

@@ -43,6 +43,7 @@ def condition(model: Model, series: FourierSeries, window: float | None = None) 
     return max(float(np.linalg.cond(W[start : start + n])) for start in range(0, len(t), 40))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [False, True])
 def test_nearly_every_start_reaches_the_floor_of_the_human_joint(offset: bool) -> None:
     design = design_excitation(HumanJoint(offset=offset))
@@ -52,6 +53,7 @@ def test_nearly_every_start_reaches_the_floor_of_the_human_joint(offset: bool) -
     assert condition(HumanJoint(offset=offset), design.trajectory) == pytest.approx(design.condition, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_robot_of_the_paper() -> None:
     design = design_excitation(ROBOT, limits=HANDLE)
     assert design.condition <= 11.5
@@ -60,6 +62,7 @@ def test_the_robot_of_the_paper() -> None:
     assert np.abs(fine(design)[0]).max() <= 10.5
 
 
+@pytest.mark.slow
 def test_the_worst_window() -> None:
     design = design_excitation(HUMAN, harmonics=7, window=2.0, starts=8)
     assert design.worst_condition <= 3.8
@@ -67,6 +70,7 @@ def test_the_worst_window() -> None:
     assert condition(HUMAN, design.trajectory) == pytest.approx(design.condition, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limits",
     [
@@ -94,6 +98,7 @@ def test_limits_are_kept_on_a_finer_grid_and_named(limits: Limits) -> None:
     assert design.active
 
 
+@pytest.mark.slow
 def test_joints_have_limits_of_their_own() -> None:
     model = Joints(HUMAN, HUMAN)
     limits = Limits(position=((-0.2, -0.5), (0.2, 1.0)), velocity=(0.3, 1.0))
@@ -248,6 +253,7 @@ def test_a_slow_encoder_does_not_hide_a_limit() -> None:
     assert np.abs(design.sampled(2400)["position"]).max() <= 0.3 * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_moved_may_be_more_than_what_is_identified() -> None:
     """Methods 1 and 3: the robot is known, and yet the motor must carry it."""
     moved, limits = ROBOT + HUMAN, Limits(position=(-10.5, 10.5), torque=0.012)

@@ -161,6 +161,7 @@ def test_joints_side_by_side_are_solved_and_judged_each_by_itself() -> None:
     assert all("joint 2: " in reason for reason in paired.verdicts.reason if reason)
 
 
+@pytest.mark.slow
 def test_emps_is_the_published_joint(data_folder: Path) -> None:
     job = parse_job(
         """
@@ -252,6 +253,7 @@ min_velocity = 0.1
 """
 
 
+@pytest.mark.slow
 def test_the_double_pendulum_is_near_its_owners_own_fit(data_folder: Path) -> None:
     """Windows of one file; all four together stand in experiments/real_recordings.py."""
     estimates = identify(parse_job(PENDULUM, data_folder))[0]

@@ -232,6 +232,7 @@ def enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_method_that_comes_with_the_job_finds_the_truth(enough: Path) -> None:
     truth = json.loads((enough / "truth.json").read_text())
     assert jaximp("identify", enough / "job.toml", "--out", enough / "out") == 0

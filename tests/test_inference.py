@@ -90,6 +90,7 @@ def test_windows_that_contradict_each_other_are_said() -> None:
     assert steps[3, 4] > 0.95
 
 
+@pytest.mark.slow
 def test_a_prior_pulls_by_its_weight() -> None:
     job = parse_job(JOB + "[posterior.prior]\nstiffness = { mean = 25, sd = 0.01 }\n")
     pulled = infer_recording(job, joint()).whole
@@ -108,6 +109,7 @@ def test_noise_of_the_position_is_corrected_for() -> None:
     assert found.whole.samples[:, 0].std() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_something_predicts_worse(found: Inference) -> None:
     without = infer_recording(parse_job(JOB.replace("human = true", "human = { offset = false }")), joint())
     difference, error = compare_models(found, without)
@@ -165,6 +167,7 @@ def test_torque_without_noise_is_refused_in_one_line() -> None:
         infer_recording(parse_job(JOB), replace(recording, torque=0 * recording.torque))
 
 
+@pytest.mark.slow
 def test_joints_side_by_side_with_heavy_tails() -> None:
     soft, stiff = joint(), joint(stiffness=35.0)
     outliers = np.random.default_rng(3).random(stiff.torque.shape) < 0.005

@@ -749,6 +749,7 @@ def test_posteriors_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.
         assert cell["p of even ranks"] < 1e-4
 
 
+@pytest.mark.slow
 def test_samplers_rank_the_truth_where_the_exact_posterior_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ranks among draws scatter about the exact probabilities as those of independent draws would."""
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "experiments")

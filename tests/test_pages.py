@@ -149,6 +149,7 @@ def test_a_page_without_live_figures_runs_no_script() -> None:
     assert len(page) < 20_000
 
 
+@pytest.mark.slow
 def test_five_minutes_at_a_kilohertz_stay_below_three_megabytes() -> None:
     rng = np.random.default_rng(0)
     long = repeat(identified(), windows=5900, samples=300_000)

@@ -47,6 +47,7 @@ def test_condition_of_the_papers_motions_is_an_independent_one() -> None:
     assert (np.diff(expected) < 0).all()
 
 
+@pytest.mark.slow
 def test_designed_perturbations_keep_their_limits_and_are_better_conditioned() -> None:
     limits = Limits(position=(-0.05, 0.05), velocity=0.3, torque=1.0)
     found = design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits, way_points=3, starts=2)
@@ -86,6 +87,7 @@ def test_perturbations_have_limits(limits: Limits, message: str) -> None:
         design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_the_order_of_the_inertia_is_lakatos_or_named() -> None:
     named = BaseInertia.from_lakatos(INERTIA)

@@ -103,7 +103,8 @@ def test_summary_is_strict_json_and_right(folder: Path) -> None:
 def test_summary_gives_values_at_the_joint(case: tuple[Job, Recording, Estimates]) -> None:
     _, source, estimates = case
     geared = parse_job(JOB.replace("offset = true", "offset = true, gear_ratio = 10"))
-    content = report.summary([estimates], geared, source)
+    behind_gear = replace(estimates, model=geared.pipeline_for(source).model)
+    content = report.summary([behind_gear], geared, source)
     joint, motor = content["at_joint"]["parameters"], content["parameters"]
     for name, factor in {"inertia": 100, "damping": 100, "stiffness": 100, "offset_torque": 10}.items():
         assert joint[name]["mean"] == pytest.approx(factor * motor[name]["mean"])

@@ -55,6 +55,7 @@ FILTERS = [
 ]
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     order=st.integers(1, 10),

@@ -256,6 +256,7 @@ def test_the_page_holds_this_table() -> None:
     assert PAGE.read_text(encoding="utf-8").endswith(table())
 
 
+@pytest.mark.slow
 @each_case
 def test_compiled_as_uncompiled_and_a_batch_as_a_loop(case: Case) -> None:
     x = jnp.asarray(case.x)
@@ -268,6 +269,7 @@ def test_compiled_as_uncompiled_and_a_batch_as_a_loop(case: Case) -> None:
     np.testing.assert_allclose(batch, loop, rtol=1e-7, atol=1e-11 * scale)
 
 
+@pytest.mark.slow
 @each_case
 def test_derivatives_are_central_differences(case: Case) -> None:
     x = jnp.asarray(case.x)

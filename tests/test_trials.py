@@ -90,6 +90,7 @@ def test_the_robot_feels_what_the_arm_is() -> None:
     np.testing.assert_allclose(clean.angles[:, -1] - clean.angles[:, 0], DIRECTIONS, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_cuff_that_hardly_yields_is_none_and_a_soft_one_hides_the_hand() -> None:
     def through(stiffness: float) -> HeldTrials:
         arm = HeldArm(reflex_gain=0.0, yields=True, cuff_stiffness=stiffness)
@@ -124,6 +125,7 @@ def test_trials_give_back_inertia_damping_and_stiffness(fitted: WindowFit) -> No
     np.testing.assert_allclose(fitted.theta[3:], TRUTH[3:], rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("position_noise", "least"), [(0.0, 0.6), (1e-5, 0.1)], ids=["force", "and position"])
 def test_standard_errors_are_not_too_small(position_noise: float, least: float) -> None:
     """Over noise keys. Noise of the position is differentiated twice and looks like much noise of the torque, of which
@@ -142,6 +144,7 @@ def test_standard_errors_are_not_too_small(position_noise: float, least: float) 
     np.testing.assert_allclose(np.mean(theta, axis=0), TRUTH, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_trial_files_are_read_cut_and_fitted(tmp_path: Path, logged: list[Recording], fitted: WindowFit) -> None:
     files = [tmp_path / f"trial_{recording.name}.csv" for recording in logged]
     for file, recording in zip(files, logged, strict=True):
@@ -359,6 +362,7 @@ def test_observations_are_a_batch(held: HeldTrials) -> None:
     np.testing.assert_allclose(together[1], fit_compiled(rows, 0.27).theta, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_shoulder_may_be_anywhere(held: HeldTrials, fitted: WindowFit) -> None:
     moved = ArmGeometry(QUIET.lengths, shoulder=(0.4, -0.2))
     trials = joint_trials(moved, held.position + np.array([0.4, -0.2]), held.force, 150, RATE)
