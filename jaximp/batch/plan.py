@@ -23,13 +23,15 @@ from urllib.parse import quote
 
 import numpy as np
 
-from jaximp.identification.solving import MOST_ROWS, stack_size
+from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers import FORMATS, RecordingError, count_samples, delimiter_of
 
 MOST_SIZES = 3
 """Padded lengths of a plan: each is compiled once, and a study should need no more than six programs."""
+LONGEST_STACKED = 400_000
+"""Samples; longer recordings are identified one by one."""
 MOST_SAMPLES = 100_000_000
 """A recording that claims more is refused before anything is read (2.4 GB of time, position and torque)."""
 FILES_IN_BATCH = 16
@@ -339,11 +341,11 @@ def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None 
     columns = channel_columns(job.recording)
     sized = sorted((_sized(item, columns) for item in items), key=lambda item: (item.partition(chosen), item.name))
     why = why_alone(job)
-    stacked = [item for item in sized if 0 < item.samples <= MOST_ROWS and not why]
+    stacked = [item for item in sized if 0 < item.samples <= LONGEST_STACKED and not why]
     sizes = padded_sizes([item.samples for item in stacked])
     groups: dict[int, list[Item]] = {size: [] for size in (*sizes, 0)}
     for item in sized:
-        fits = 0 < item.samples <= MOST_ROWS and not why
+        fits = 0 < item.samples <= LONGEST_STACKED and not why
         groups[next(size for size in sizes if size >= item.samples) if fits else 0].append(item)
     batches: list[Batch] = []
     for size, members in groups.items():
