@@ -230,6 +230,7 @@ def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
         np.testing.assert_array_equal(one.solved[0].fit.stderr, other.solved[0].fit.stderr)
 
 
+@pytest.mark.slow
 def test_one_window_as_long_as_the_recording() -> None:
     """A program of a few windows only once made XLA break off the process."""
     job = parse_job(JOB.replace("decimation_cutoff = 10", "").replace("length = 1", "length = 4"))
@@ -379,6 +380,7 @@ def test_a_human_in_a_robot_takes_the_manifests_robot(tmp_path: Path) -> None:
         np.testing.assert_allclose(pq.ParquetFile(path).read()["stiffness"], np.asarray(one.fit.theta)[:, 2], 1e-12)
 
 
+@pytest.mark.slow
 def test_a_study_has_conditions_of_its_own(tmp_path: Path) -> None:
     """Beside the condition number; and no column of the windows can be shadowed by one of the manifest."""
     import pyarrow.dataset as ds
@@ -1088,6 +1090,7 @@ def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypa
         run(study, tmp_path / "c", workers=1)
 
 
+@pytest.mark.slow
 def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
     command = [
         sys.executable,

@@ -110,6 +110,7 @@ def test_joints_have_limits_of_their_own() -> None:
     assert design.sampled(100)["position"].shape == (1000, 2)
 
 
+@pytest.mark.slow
 def test_from_rest_to_rest() -> None:
     design = design_excitation(HUMAN, rest=True, harmonics=5, starts=8, limits=Limits(position=(-0.5, 0.5)))
     q, dq, ddq = (np.asarray(x) for x in design.trajectory(np.array([0.0, design.period])))
@@ -145,6 +146,7 @@ def test_errors_name_the_cause(settings: dict[str, Any], message: str) -> None:
         design_excitation(ROBOT, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [None, 3.0])
 @pytest.mark.parametrize("objective", ["condition", "determinant", "sigma_min", "stderr"])
 def test_gradients_are_central_differences(objective: str, window: float | None) -> None:
@@ -178,6 +180,7 @@ def slope(s: float, gram: jax.Array, change: jax.Array) -> jax.Array:
     return objectives.log_sigma_min((gram + s * change)[None])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-1, 1e-4, 1e-7])
 @pytest.mark.parametrize("p", [2, 3, 6])
 def test_derivatives_of_nearly_equal_eigenvalues(p: int, gap: float) -> None:
@@ -202,6 +205,7 @@ def test_objectives_are_what_they_say() -> None:
     assert float(objectives.log_stderr(gram, 2)[0]) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_a_standard_error_is_that_of_the_measurements() -> None:
     design = design_excitation(
         HUMAN, objective="stderr", parameter="stiffness", limits=Limits(position=(-0.5, 0.5)), starts=8, sample_rate=200
@@ -211,6 +215,7 @@ def test_a_standard_error_is_that_of_the_measurements() -> None:
     assert design.value == pytest.approx(np.sqrt(np.linalg.inv(W.T @ W)[2, 2]), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_design_says_what_it_does_not_do() -> None:
     """Holding still at the highest angle is best for a stiffness alone, and leaves inertia and damping unknown."""
     limits = Limits(position=(-0.5, 0.5))
@@ -225,6 +230,7 @@ def test_a_design_says_what_it_does_not_do() -> None:
     assert any(line.startswith("at the lower bound 1.732") for line in offset.in_words())
 
 
+@pytest.mark.slow
 def test_a_mean_position_is_kept() -> None:
     limits = Limits(position=(-0.5, 0.5))
     design = design_excitation(HUMAN, limits=limits, window=2.0, mean=0.1, starts=4)
@@ -234,6 +240,7 @@ def test_a_mean_position_is_kept() -> None:
         design_excitation(HUMAN, limits=limits, mean=0.7)
 
 
+@pytest.mark.slow
 def test_condition_over_sliding_windows() -> None:
     """The window that ends at each instant, back across the beginning of the period."""
     design = design_excitation(HUMAN, limits=Limits(position=(-0.5, 0.5)))
@@ -246,6 +253,7 @@ def test_condition_over_sliding_windows() -> None:
         assert found[k] == pytest.approx(np.linalg.cond(W[last + 1 - n : last + 1]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_slow_encoder_does_not_hide_a_limit() -> None:
     limits = Limits(position=(-0.3, 0.3))
     encoder = Encoder(step=1e-3, sample_rate=3.0, cutoff=1.0, order=2)
@@ -267,6 +275,7 @@ def test_what_is_moved_may_be_more_than_what_is_identified() -> None:
     assert design.value == pytest.approx(np.linalg.cond(W), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_columns_compared_by_the_torque_that_they_make() -> None:
     scale = np.array([1e-3, 0.05, 2.0])
     design = design_excitation(HUMAN, scale=scale)
@@ -275,6 +284,7 @@ def test_columns_compared_by_the_torque_that_they_make() -> None:
     assert design.value == pytest.approx(np.linalg.cond(W * scale), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_encoder_is_in_the_loop() -> None:
     """Tout et al. 2023, V-A: what the encoder makes of the motion is what is judged."""
     encoder = Encoder(step=0.05, sample_rate=100.0, cutoff=5.0)
@@ -287,6 +297,7 @@ def test_the_encoder_is_in_the_loop() -> None:
     assert design.value == pytest.approx(float(np.linalg.svd(rows, compute_uv=False)[-1]), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "harmonics", "period", "starts"),
     [
@@ -310,6 +321,7 @@ def test_the_closed_form_is_the_convex_program() -> None:
     assert bounds._convex_bound([np.eye(4)[:3]], 5, 10.0) == pytest.approx(FLOOR, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_optimiser_finds_the_bottom_of_a_bowl(method: str) -> None:
     target = jnp.array([0.3, -0.2, 0.1])

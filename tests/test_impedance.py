@@ -66,6 +66,7 @@ def results(arm: Path) -> Path:
     return arm / "out"
 
 
+@pytest.mark.slow
 def test_simulated_arm_is_read_by_its_job(arm: Path) -> None:
     job = read_job(arm / "job.toml")
     assert job.trials is not None
@@ -247,6 +248,7 @@ def test_the_method_that_comes_with_the_job_finds_the_truth(enough: Path) -> Non
     assert (row["unperturbed"], row["misfit"]) == (32, found["misfit"])
 
 
+@pytest.mark.slow
 def test_given_inertia_without_errors_is_a_warning(enough: Path) -> None:
     text = (enough / "job.toml").read_text()
     start, end = text.index("[trials.posture]"), text.index("[model.arm]")
@@ -276,6 +278,7 @@ SPOILT: dict[str, tuple[Callable[[Trials], Trials], Handle, str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SPOILT)
 def test_force_command_and_handle_must_agree(enough: Path, case: str) -> None:
     """Output error does not look at the force, and would believe a handle of another damping."""

@@ -121,6 +121,7 @@ def test_a_model_that_lacks_something_predicts_worse(found: Inference) -> None:
         compare_models(found, other)
 
 
+@pytest.mark.slow
 def test_draws_of_windows_that_cannot_be_trusted_are_not_believed() -> None:
     """A torque of which the model explains little has a posterior all the same."""
     recording = joint()

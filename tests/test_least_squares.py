@@ -236,6 +236,7 @@ def test_coloured_noise_is_the_explicit_formula(n: int, masked: bool, outputs: t
         assert float(fit.dof) == pytest.approx(dof, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_may_reach_further_than_the_window() -> None:
     """In a process of its own: XLA's simplifier aborted here."""
     program = """

@@ -275,6 +275,7 @@ def test_stretches_have_rows_enough_for_their_parameters() -> None:
 # Densities
 
 
+@pytest.mark.slow
 def test_gaussian_density_needs_no_rows_and_is_students_t() -> None:
     W, y = record()
     density = linear_density(NAMES, UNITS, whiten(W, y))
@@ -303,6 +304,7 @@ def test_gaussian_density_needs_no_rows_and_is_students_t() -> None:
     np.testing.assert_allclose(covariance[3, 3], 1 / 120, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_outputs_have_their_own_noise() -> None:
     arm = PlanarArm(equilibrium=(0.3, 0.4))
     random = np.random.default_rng(0)
@@ -319,6 +321,7 @@ def test_two_outputs_have_their_own_noise() -> None:
     np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_heavy_tails_shrug_off_outliers() -> None:
     W, y = record(200)
     y[::20] += 30.0
@@ -339,6 +342,7 @@ def test_heavy_tails_shrug_off_outliers() -> None:
     np.testing.assert_allclose(mode, found.x, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_long_records_are_whitened_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     r = signals.autocovariance(BAND_PASS, 20)
     W, y = (np.asarray(signals.filter_zero_phase(BAND_PASS, x))[::20] for x in record(20 * 30 * len(r)))
@@ -364,6 +368,7 @@ def test_trials_together_are_one_record() -> None:
     np.testing.assert_allclose(value(linear_density(NAMES, UNITS, joined(parts)), at), value(whole, at))
 
 
+@pytest.mark.slow
 def test_many_windows_are_windows_one_by_one() -> None:
     W, y = record(300)
     W[100:160, 2] = 0
@@ -396,6 +401,7 @@ def test_many_windows_are_windows_one_by_one() -> None:
         )
 
 
+@pytest.mark.slow
 def test_stiffness_density_is_flat_in_the_stiffness() -> None:
     displacement, velocity, torque = pulses()
     density = arm_density()
@@ -427,6 +433,7 @@ def test_a_mode_is_found_where_the_data_ask_for_an_indefinite_stiffness() -> Non
     np.testing.assert_allclose(gradient(density, mode) * np.sqrt(np.diag(covariance)), 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_adjusted_curvature_is_the_covariance_of_trials() -> None:
     random = np.random.default_rng(0)
     displacement, velocity, _ = (x.reshape(12, 25, 2) for x in pulses())

@@ -120,6 +120,7 @@ def shares_of_error(read: Trials, truth: Trials, which: np.ndarray, every: int) 
     return shares
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 2])
 def test_movements_are_those_of_the_simulation(simulated: Reaches, pushed: np.ndarray, every: int) -> None:
     """The bounds are a little above what was measured; the filter takes that much off the perturbation's spectrum."""

@@ -41,6 +41,7 @@ def quiet() -> Reaches:
     return simulate(ARM, TASK, PUSHES, QUIET)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", [ARM, subject(3)], ids=["paper", "another build"])
 def test_without_noise_and_perturbation_the_arm_moves_as_planned(arm: NeuromuscularArm) -> None:
     moved = simulate(arm, TASK, PUSHES, QUIET).movements  # the first is not pushed
@@ -78,6 +79,7 @@ def test_small_opposite_pushes_move_the_arm_oppositely(quiet: Reaches) -> None:
     np.testing.assert_allclose(there, -back, atol=2e-4 * float(jnp.abs(there).max()))
 
 
+@pytest.mark.slow
 def test_work_of_a_push_becomes_kinetic_energy() -> None:
     """Muscles without springs, handle without damping: the energy of arm and handle is what the command has done."""
     limp = NeuromuscularArm(
@@ -116,6 +118,7 @@ def test_feedback_comes_after_its_delay() -> None:
     assert apart[k + delay + 40] > 1e-2
 
 
+@pytest.mark.slow
 def test_steps_one_by_one_are_the_scan(quiet: Reaches) -> None:
     time = np.arange(60) / RATE
     q, dq, ddq = ARM.geometry.joint_motion(*TASK(time))
@@ -131,6 +134,7 @@ def test_steps_one_by_one_are_the_scan(quiet: Reaches) -> None:
         np.testing.assert_allclose(sample.position[:, 0], quiet.movements.position[0, k], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_trials_do_not_disturb_each_other() -> None:
     noise = neural_noise(jax.random.key(0), 3, 2000)
     forces = perturbing_forces(jax.random.key(1))[:3]

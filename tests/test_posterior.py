@@ -288,6 +288,7 @@ def test_the_seed_makes_the_chain() -> None:
     assert (one.chains[:, :50] != other.chains[:, :50]).all()
 
 
+@pytest.mark.slow
 def test_near_singular_stiffness_is_sampled_as_it_is() -> None:
     """The factor's last element piles up at zero; both samplers, from a start and a covariance that are rough."""
     R, count = soft(0)
@@ -310,6 +311,7 @@ def banana(theta: Array) -> Array:
     return -(theta[0] ** 2) / 2 - ((theta[1] - theta[0] ** 2) / 0.3) ** 2 / 2
 
 
+@pytest.mark.slow
 def test_a_curved_ridge_is_marked_or_sampled_into_its_tails() -> None:
     """emcee with fewer steps than it needs says so; trajectories reach the tails, where they must be short."""
     assert not sample_posterior(banana, np.zeros(2), max_steps=1500).ok
@@ -440,6 +442,7 @@ def test_emcee_reads_the_file(tmp_path: Path) -> None:
     assert backend.accepted.sum() > 0
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_resumes(tmp_path: Path) -> None:
     """Killed without warning, between or while writing: what is there is whole."""
     program = """
@@ -512,6 +515,7 @@ def windows(n: int = 5) -> PosteriorMany:
     return sample_many(density, starts, covariances, jax.random.key(3))
 
 
+@pytest.mark.slow
 def test_every_window_has_its_exact_posterior() -> None:
     many = windows()
     np.testing.assert_array_equal(many.ok, [True, False, True, False, True])

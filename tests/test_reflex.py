@@ -307,6 +307,7 @@ def test_the_other_direction_is_told_by_the_sign_of_the_gain_and_by_what_is_pred
     assert np.nanmean(wrong.held_out_vaf) < np.nanmean(right.held_out_vaf) - 0.05
 
 
+@pytest.mark.slow
 def test_windows_are_those_of_numpy_and_the_gain_has_its_covariance() -> None:
     job = parse_job(JOB)
     prepared = prepare(job.pipeline_for(joint()), joint())
@@ -360,6 +361,7 @@ def test_the_threshold_for_fake_changes_knows_the_past_of_a_period() -> None:
     assert estimates.threshold == pytest.approx(np.linalg.cond(steady) * 4 / 3, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_human_with_a_reflex_is_told_from_the_robot() -> None:
     """Robot and human together: the gain's standard error takes a fit of its own, by the same method."""
     q, dq, ddq = motion(6)

@@ -120,6 +120,7 @@ def test_the_matrix_of_a_filter_is_what_scipy_makes_of_impulses(sos: NDArray[np.
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sos", FILTERS[::3])
 def test_filter_vmap_is_a_loop(sos: NDArray[np.float64]) -> None:
     x = noise((5, 100, 2))

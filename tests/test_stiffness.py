@@ -86,6 +86,7 @@ def test_optimum_is_that_of_a_convex_solver(damping: str) -> None:
         np.testing.assert_allclose(fit.D[k], damped, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_minimum_is_that_of_scipy_on_all_samples() -> None:
     displacement, velocity, torque = (x[0] for x in trials(1, 6))
 
@@ -123,6 +124,7 @@ def test_linear_fit_is_that_of_numpy_and_has_no_symmetry() -> None:
     np.testing.assert_allclose(fit.theta, expected[:, [0, 1]].ravel().tolist() + expected[:, [2, 3]].ravel().tolist())
 
 
+@pytest.mark.slow
 def test_merged_trials_are_all_data_together() -> None:
     arrays = [x[0] for x in trials(1, 6)]
     each = residual_triangle(*arrays)
@@ -170,6 +172,7 @@ def test_indefinite_data_end_on_the_boundary() -> None:
     np.testing.assert_allclose(resisting.K, 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_failed_fit_is_named_and_harms_no_other() -> None:
     displacement, velocity, torque = trials(4, 6)
     displacement[1, ..., 1] = 2 * displacement[1, ..., 0]
@@ -191,6 +194,7 @@ def noisy() -> jax.Array:
     return residual_triangle(*trials(256, 8, seed=1))
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_trials() -> None:
     linear = fit_triangles_linear(noisy(), 40)
     for fit, truth in (
@@ -217,6 +221,7 @@ def test_standard_errors_on_the_boundary_are_not_too_small() -> None:
     assert (claimed > 0.9).all()
 
 
+@pytest.mark.slow
 def test_covariance_is_what_leaving_out_trials_does() -> None:
     triangles = noisy()[0]
     whole = fit_triangles(triangles, 40).theta
@@ -225,6 +230,7 @@ def test_covariance_is_what_leaving_out_trials_does() -> None:
     assert np.isnan(fit_triangles(triangles[:4], 40).covariance).all()
 
 
+@pytest.mark.slow
 def test_derivatives_are_differences_inside_and_on_the_boundary() -> None:
     triangles = jnp.asarray(indefinite_triangles())[:, None]
     boundary = np.asarray(fit_triangles(triangles, 40).on_boundary)
