@@ -14,6 +14,8 @@ import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
 
+from paths import ROOT
+
 jax.config.update("jax_enable_x64", True)
 install_import_hook("jaximp", "shapes.checked")
 
@@ -55,7 +57,7 @@ def little_memory() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """Real recordings, which are not part of this project."""
-    folder = Path(os.environ.get("JAXIMP_DATA") or Path(__file__).parents[1] / "../shared/data")
+    folder = Path(os.environ.get("JAXIMP_DATA") or ROOT / "../shared/data")
     if not folder.is_dir():
         pytest.skip("no real recordings here: set JAXIMP_DATA to the folder that holds emps, ankle, double_pendulum")
     return folder

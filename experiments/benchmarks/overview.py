@@ -20,7 +20,6 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1] / "tests"))
 
 from browser import Browser, browser, executable  # noqa: E402
-
 from jaximp.batch.overview import Series, write_overview  # noqa: E402
 from jaximp.reports.pages import table_of  # noqa: E402
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ from scipy.stats import t as student
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import read_job
 from jaximp.jobs.run import identify
+from paths import ROOT
 
-FOLDER = Path(__file__).parents[1] / "examples"
+FOLDER = ROOT / "examples"
 ANKLE = runpy.run_path(str(FOLDER / "make_ankle.py"))
 
 

@@ -22,8 +22,8 @@ import typer
 from jaximp.cli.main import app
 from jaximp.jobs.design import parse_design_job
 from jaximp.jobs.job import parse_job
+from paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))

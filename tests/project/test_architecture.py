@@ -7,11 +7,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "jaximp"
+from paths import ROOT
+
+PACKAGE = ROOT / "jaximp"
 
 PACKAGES = (
     "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust",

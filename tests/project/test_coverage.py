@@ -1,17 +1,18 @@
 """A small run of the calibration experiment, which the textbook's standard errors would fail."""
 
 import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
+
+from paths import ROOT
 
 RECORDS = 400
 
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_and_the_textbooks_do_not() -> None:
-    path = Path(__file__).parents[1] / "experiments" / "coverage.py"
+    path = ROOT / "experiments" / "coverage.py"
     spec = importlib.util.spec_from_file_location("coverage_experiment", path)
     assert spec is not None
     assert spec.loader is not None

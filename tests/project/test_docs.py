@@ -6,12 +6,12 @@ import ast
 import importlib
 import re
 import runpy
-from pathlib import Path
 
 import pytest
 from test_architecture import PACKAGES
 
-ROOT = Path(__file__).parents[1]
+from paths import ROOT
+
 JOB_KEYS = runpy.run_path(str(ROOT / "docs" / "make_job_keys.py"))
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
 TABLES = [table for job in ("RECORDING_JOB", "TRIALS_JOB", "DESIGN_JOB") for table in JOB_KEYS[job]]
@@ -45,7 +45,8 @@ def test_functions_of_the_equations_exist(function: str) -> None:
 
 @pytest.mark.parametrize("file", sorted({row[1] for row in ROWS}))
 def test_tests_of_the_equations_exist(file: str) -> None:
-    tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+    (path,) = (ROOT / "tests").rglob(file)
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
     assert {row[2] for row in ROWS if row[1] == file} <= defined
 

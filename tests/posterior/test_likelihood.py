@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -48,6 +47,7 @@ from jaximp.posterior.densities import (
 )
 from jaximp.posterior.predictive import log_score, log_scores, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, make_prior
+from paths import ROOT
 
 Numbers = NDArray[np.float64]
 
@@ -740,7 +740,7 @@ def test_bands_of_heavy_tails_reach_as_far_as_these(heavy_tails: bool | float, n
 
 
 def test_posteriors_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+    monkeypatch.syspath_prepend(ROOT / "experiments")
     experiment = importlib.import_module("calibration")
     monkeypatch.setattr(experiment, "RECORDS", 400)
     random = np.random.default_rng(11)
@@ -759,7 +759,7 @@ def test_posteriors_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.
 @pytest.mark.slow
 def test_samplers_rank_the_truth_where_the_exact_posterior_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ranks among draws scatter about the exact probabilities as those of independent draws would."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+    monkeypatch.syspath_prepend(ROOT / "experiments")
     experiment = importlib.import_module("calibration")
     random, truth = np.random.default_rng(3), np.array([0.1, 1.5, 20.0, 0.0, np.log(0.3)])
     W = random.normal(size=(16, 24, 4)) * [10, 1, 0.1, 1]

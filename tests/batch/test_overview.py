@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from browser import Browser, browser, executable
 from scipy import stats
 
+from browser import Browser, browser, executable
 from jaximp.batch import overview
 from jaximp.batch.overview import Series, group_means, thinned, write_overview
 from jaximp.reports.pages import table_of

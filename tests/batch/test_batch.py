@@ -21,9 +21,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from browser import browser, executable
 from numpy.typing import NDArray
 
+from browser import browser, executable
 from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch

@@ -38,6 +38,7 @@ from jaximp.posterior.draws import (
 )
 from jaximp.posterior.files import load_posterior, save_posterior
 from jaximp.posterior.samplers import sample_many, sample_posterior
+from paths import ROOT
 
 EIGHT = ("D11", "D12", "D21", "D22", "l11", "l21", "l22", "log_noise")
 
@@ -457,7 +458,7 @@ def test_a_run_that_is_killed_resumes(tmp_path: Path) -> None:
         chain_run(Path({file!r}), ess=1e6)
     """
     file = tmp_path / "chain.h5"
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    paths = [str(Path(__file__).parent), str(ROOT)]
     code = textwrap.dedent(program.format(path=paths, file=str(file)))
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as process:
         for _ in range(600):

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,8 +25,9 @@ from jaximp.models.endpoint import ellipse, endpoint_impedance
 from jaximp.perturbation.stiffness import merge_triangles, residual_triangle
 from jaximp.posterior.densities import estimate_density, linear_density, stiffness_density
 from jaximp.simulation.rig import HumanLoad, Rig, simulate_rig
+from paths import ROOT
 
-PAGE = Path(__file__).parents[1] / "docs" / "transformations.md"
+PAGE = ROOT / "docs" / "transformations.md"
 QUICK = {"xla_backend_optimization_level": 0}
 """To compile, not to run."""
 
@@ -39,7 +39,7 @@ MOTION = random.normal(size=(6, 3))
 TRIALS = random.normal(size=(3, 20, 6))
 TRIALS[..., 4:] += TRIALS[..., :2] @ np.array([[2.0, 0.3], [0.1, 1.0]])
 TRIALS[..., 4:] += TRIALS[..., 2:4] @ np.array([[30.0, 5.0], [5.0, 20.0]])
-ROOT = random.normal(size=(5, 3))
+R = random.normal(size=(5, 3))
 LOW_PASS = signals.butterworth(2, 20.0, 200.0)
 NOISE = np.array([1.0, 0.5, 0.2])
 ARM = models.ArmGeometry((0.3, 0.35))
@@ -197,14 +197,10 @@ CASES = [
         np.array([2.0, 0.1, 0.3, 1.0, 5.0, 1.0, 4.0, -0.5]),
         "stiffness_density",
     ),
-    Case(
-        "objectives.log_condition", lambda x: objectives.log_condition(x.T @ x)[None], ROOT, "the root of a Gram matrix"
-    ),
-    Case(
-        "objectives.log_sigma_min", lambda x: objectives.log_sigma_min(x.T @ x)[None], ROOT, "the root of a Gram matrix"
-    ),
-    Case("objectives.log_volume", lambda x: objectives.log_volume(x.T @ x)[None], ROOT, "the root of a Gram matrix"),
-    Case("objectives.log_stderr", lambda x: objectives.log_stderr(x.T @ x, 1)[None], ROOT, "the root of a Gram matrix"),
+    Case("objectives.log_condition", lambda x: objectives.log_condition(x.T @ x)[None], R, "the root of a Gram matrix"),
+    Case("objectives.log_sigma_min", lambda x: objectives.log_sigma_min(x.T @ x)[None], R, "the root of a Gram matrix"),
+    Case("objectives.log_volume", lambda x: objectives.log_volume(x.T @ x)[None], R, "the root of a Gram matrix"),
+    Case("objectives.log_stderr", lambda x: objectives.log_stderr(x.T @ x, 1)[None], R, "the root of a Gram matrix"),
     Case(
         "simulate_rig",
         lambda x: (
