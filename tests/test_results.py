@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from test_identify import JOB, joint
 
+from factories.joints import JOB, joint
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify_recording, infer_recording

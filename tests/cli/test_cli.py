@@ -2,18 +2,17 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
-from test_identify import TIME, joint
 
+import command_line
 import jaximp
+from factories.joints import TIME, joint
 from jaximp import papers
-from jaximp.cli import main as cli
 from jaximp.cli.reproduce import Paper
 from jaximp.recordings.load import save_recording
 
@@ -42,16 +41,13 @@ def job(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+def run(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
     """Run `jaximp ...` in this process: exit status, standard output, standard error."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
 
     def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
+        status = command_line.jaximp(*arguments)
         said, complained = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in capsys.readouterr())  # without colours
-        return int(stopped.value.code or 0), said, complained
+        return status, said, complained
 
     return call
 

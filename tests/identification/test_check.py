@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_identify import JOB, TIME, joint
 
+from factories.joints import JOB, TIME, joint
 from jaximp.identification.check import BAD, LOOK, coherent_bandwidth, estimate_delay
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import check, identify_recording

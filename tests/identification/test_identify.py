@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factories.joints import JOB, TIME, TRUTH, ankle_job, joint
 from jaximp.identification.identify import in_windows, prepare
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify, identify_recording
@@ -13,33 +14,6 @@ from jaximp.least_squares.window import confidence_interval
 from jaximp.models import PlanarArm
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.types import Recording
-
-TIME = np.arange(8000) * 1e-3
-TRUTH = {"inertia": 0.1, "damping": 1.5, "stiffness": 20.0, "offset_torque": -2.0}
-JOB = """
-recording = {}
-[model]
-human = true
-[filter]
-position_cutoff = 40
-decimation_cutoff = 20
-[window]
-length = 1
-step = 0.1
-"""
-
-
-def joint(**changes: float) -> Recording:
-    """A joint that moves at three frequencies, with torque noise."""
-    truth = TRUTH | changes
-    lines = ((0.2, 1.1, 0.0), (0.1, 2.9, 0.5), (0.04, 6.3, 1.0))
-    q, dq, ddq = (
-        sum(a * (2 * np.pi * f) ** k * np.sin(2 * np.pi * f * TIME + p + k * np.pi / 2) for a, f, p in lines)
-        for k in range(3)
-    )
-    torque = truth["inertia"] * ddq + truth["damping"] * dq + truth["stiffness"] * q + truth["offset_torque"]
-    noise = np.random.default_rng(1).normal(0, 0.2, len(TIME))
-    return recording_from_arrays(TIME, np.asarray(q), torque + noise)
 
 
 def test_finds_a_simulated_joint_and_predicts_what_it_has_not_seen() -> None:
@@ -194,26 +168,8 @@ def test_emps_is_the_published_joint(data_folder: Path) -> None:
     np.testing.assert_allclose(mass, published["inertia"], rtol=0.02)
 
 
-ANKLE = """
-[recording]
-file = "ankle/z_df2.csv"
-time = "time_s"
-position = "position_rad"
-torque = { column = "torque_Nm", sign = -1 }
-[model]
-human = { offset = false }
-[filter]
-position_cutoff = 45
-decimation_cutoff = 45
-high_pass = 0.3
-[window]
-length = 5
-step = 0.5
-"""
-
-
 def test_the_clean_ankle_is_trusted_and_right(data_folder: Path) -> None:
-    estimates = identify(parse_job(ANKLE, data_folder))[0]
+    estimates = identify(ankle_job(data_folder, "z_df2.csv", "{ offset = false }", 0.5))[0]
     mean = dict(zip(estimates.names, estimates.mean_over_trusted(), strict=True))
     assert estimates.verdicts.trusted.mean() > 0.9
     assert mean["stiffness"] == pytest.approx(64, abs=6)
@@ -223,8 +179,8 @@ def test_the_clean_ankle_is_trusted_and_right(data_folder: Path) -> None:
 
 
 def test_the_ankle_with_a_reflex_is_called_a_poor_fit(data_folder: Path) -> None:
-    text = ANKLE.replace("z_df2.csv", "z_pf.npz").replace('time = "time_s"', 'sample_rate = "sample_rate_Hz"')
-    counts = identify(parse_job(text, data_folder))[0].verdicts.counts()
+    job = ankle_job(data_folder, "z_pf.npz", "{ offset = false }", 0.5)
+    counts = identify(job)[0].verdicts.counts()
     assert counts["trusted"] == 0
     assert counts["poor fit"] > 0.9 * sum(counts.values())
 

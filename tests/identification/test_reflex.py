@@ -16,13 +16,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
+from factories.joints import ankle_job
 from jaximp.design import excitation
 from jaximp.identification import FilterSettings
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.identify import in_windows, prepare
 from jaximp.identification.regression import measure, regress, undisturbed
-from jaximp.jobs import Job, parse_job
+from jaximp.jobs import parse_job
 from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import least_squares
 from jaximp.models import (
@@ -416,31 +417,11 @@ def test_parameters_that_are_named_are_judged() -> None:
     assert any("reflex_160ms" in reason for reason in found.reason)
 
 
-def ankle(folder: Path, reflex: str, file: str = "z_pf.npz") -> Job:
-    rate = 'sample_rate = "sample_rate_Hz"' if file.endswith("npz") else 'time = "time_s"'
-    return parse_job(
-        f"""
-[recording]
-file = "ankle/{file}"
-{rate}
-position = "position_rad"
-torque = {{ column = "torque_Nm", sign = -1 }}
-[model]
-human = {{ offset = false, reflex = {reflex} }}
-[filter]
-position_cutoff = 45
-decimation_cutoff = 45
-high_pass = 0.3
-[window]
-length = 5
-step = 2.5
-""",
-        folder,
-    )
-
-
 def test_the_ankle_with_a_reflex_is_explained_by_one(data_folder: Path) -> None:
-    found = {name: identify(ankle(data_folder, name))[0] for name in ("true", "{ direction = -1 }")}
+    reflexes = ("true", "{ direction = -1 }")
+    human = "{{ offset = false, reflex = {} }}"
+    jobs = {name: ankle_job(data_folder, "z_pf.npz", human.format(name), 2.5) for name in reflexes}
+    found = {name: identify(job)[0] for name, job in jobs.items()}
     held_out = {name: float(np.nanmean(estimates.held_out_vaf)) for name, estimates in found.items()}
     assert held_out["true"] > 0.86
     assert held_out["{ direction = -1 }"] < 0.75

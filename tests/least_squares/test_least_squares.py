@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 from scipy.stats import t as student
 
+from factories.regressions import THETA, regression
 from jaximp.least_squares.window import (
     DENSE_ROWS,
     WindowFit,
@@ -26,17 +27,8 @@ from jaximp.least_squares.window import (
 )
 
 Numbers = NDArray[np.float64]
-THETA = np.array([0.1, 1.5, 20.0, -3.0])
 
 fit_of: Callable[..., WindowFit] = jax.jit(least_squares)
-
-
-def window(
-    n: int = 60, p: int = 4, outputs: tuple[int, ...] = (), seed: int = 0, scale: float = 0.1
-) -> tuple[Numbers, Numbers]:
-    random = np.random.default_rng(seed)
-    W = random.normal(size=(n, *outputs, p)) * np.array([30.0, 3.0, 0.3, 1.0])[:p]
-    return W, W @ THETA[:p] + scale * random.normal(size=(n, *outputs))
 
 
 def all_fields(fit: WindowFit) -> dict[str, Numbers]:
@@ -57,7 +49,7 @@ def assert_nan(fit: WindowFit) -> None:
 
 @pytest.mark.parametrize(("n", "p"), [(5, 4), (60, 1), (700, 4)], ids=str)
 def test_everything_against_numpy(n: int, p: int) -> None:
-    W, y = window(n, p)
+    W, y = regression(n, p)
     fit = fit_of(W, y)
     theta, rss, _, singular = np.linalg.lstsq(W, y)
     np.testing.assert_allclose(fit.theta, theta, rtol=1e-10)
@@ -77,7 +69,7 @@ def test_everything_against_numpy(n: int, p: int) -> None:
 
 def test_parameters_and_standard_errors_are_those_of_statsmodels() -> None:
     api = pytest.importorskip("statsmodels.api")
-    W, y = window(200)
+    W, y = regression(200, 4)
     ols, fit = api.OLS(y, W).fit(), fit_of(W, y)
     np.testing.assert_allclose(fit.theta, ols.params, rtol=1e-10)
     np.testing.assert_allclose(fit.stderr, ols.bse, rtol=1e-10)
@@ -99,7 +91,7 @@ def test_the_condition_number_enters_once(condition: float) -> None:
 @pytest.mark.parametrize("hidden", [0.0, np.nan, np.inf, 1e300], ids=["zero", "NaN", "infinite", "huge"])
 @pytest.mark.parametrize("noise", [None, "known"], ids=["white", "coloured"])
 def test_a_mask_deletes_rows_whatever_they_hold(hidden: float, noise: str | None) -> None:
-    W, y = window(80)
+    W, y = regression(80, 4)
     valid = np.random.default_rng(1).random(80) < 0.7
     covariance = toeplitz(0.8 ** np.arange(80))
     known = (None, None) if noise is None else (covariance, covariance[np.ix_(valid, valid)])
@@ -108,7 +100,7 @@ def test_a_mask_deletes_rows_whatever_they_hold(hidden: float, noise: str | None
 
 
 def test_a_mask_hides_nan_without_jit_too() -> None:
-    W, y = window(80)
+    W, y = regression(80, 4)
     valid = np.random.default_rng(1).random(80) < 0.7
     broken_W, broken_y = np.where(valid[:, None], W, np.nan), np.where(valid, y, np.nan)
     assert_same(least_squares(jnp.asarray(broken_W), jnp.asarray(broken_y), valid), fit_of(W[valid], y[valid]))
@@ -116,7 +108,7 @@ def test_a_mask_hides_nan_without_jit_too() -> None:
 
 @pytest.mark.parametrize("masked", [False, True], ids=["all samples", "masked"])
 def test_several_outputs_are_stacked_rows(masked: bool) -> None:
-    W, y = window(50, 4, (3,))
+    W, y = regression(50, 4, (3,))
     valid = np.random.default_rng(1).random((50, 3)) < (0.6 if masked else 2)
     assert_same_but_vaf(fit_of(W, y, valid), fit_of(W[valid], y[valid]))
     vaf = fit_of(W, y, valid).vaf
@@ -136,7 +128,7 @@ def assert_same_but_vaf(fit: WindowFit, other: WindowFit) -> None:
 
 
 def deficient(kind: str) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
-    W, y = window(60)
+    W, y = regression(60, 4)
     valid = np.ones(60, bool)
     match kind:
         case "equal columns":
@@ -187,13 +179,13 @@ def test_without_a_unique_solution_everything_is_nan(kind: str, noise: Numbers |
 
 
 def test_fewer_rows_than_parameters_is_nan_not_an_error() -> None:
-    W, y = window(3)
+    W, y = regression(3, 4)
     assert_nan(fit_of(W, y))
 
 
 @pytest.mark.parametrize("noise", [None, np.array([1.0, 0.4])], ids=["white", "coloured"])
 def test_as_many_samples_as_parameters_leave_no_degrees_of_freedom(noise: Numbers | None) -> None:
-    W, y = window(4)
+    W, y = regression(4, 4)
     fit = fit_of(W, y, noise=noise)
     np.testing.assert_allclose(fit.theta, np.linalg.solve(W, y), rtol=1e-9)
     assert np.isnan(fit.stderr).all()
@@ -202,7 +194,7 @@ def test_as_many_samples_as_parameters_leave_no_degrees_of_freedom(noise: Number
 
 @pytest.mark.parametrize("masked", [False, True], ids=["all samples", "masked"])
 def test_white_noise_is_the_textbook_result(masked: bool) -> None:
-    W, y = window(90)
+    W, y = regression(90, 4)
     valid = np.random.default_rng(2).random(90) < (0.5 if masked else 2)
     textbook = fit_of(W, y, valid)
     assert_same(fit_of(W, y, valid, np.array([1.0])), textbook)
@@ -214,7 +206,7 @@ def test_white_noise_is_the_textbook_result(masked: bool) -> None:
 @pytest.mark.parametrize("masked", [False, True], ids=["all samples", "masked"])
 @pytest.mark.parametrize("outputs", [(), (2,)], ids=["one output", "two outputs"])
 def test_coloured_noise_is_the_explicit_formula(n: int, masked: bool, outputs: tuple[int, ...]) -> None:
-    W, y = window(n, 4, outputs)
+    W, y = regression(n, 4, outputs)
     valid = np.random.default_rng(2).random(y.shape) < (0.7 if masked else 2)
     lags = np.convolve(np.ones(15), np.ones(15))[14:] * np.cos(0.1 * np.arange(15))
     covariance = toeplitz(np.r_[lags, np.zeros(n - 15)])
@@ -290,7 +282,7 @@ def test_confidence_interval_is_students(level: float) -> None:
 
 
 def test_confidence_interval_of_a_fit_is_that_of_its_numbers() -> None:
-    fit = least_squares(*window())
+    fit = least_squares(*regression(60, 4))
     for level in (0.5, 0.95):
         expected = confidence_interval(fit.theta, fit.stderr, fit.dof, level)
         np.testing.assert_array_equal(confidence_interval(fit, level), expected)
@@ -304,7 +296,7 @@ def test_confidence_interval_of_a_fit_is_that_of_its_numbers() -> None:
 @given(powers=st.lists(st.integers(-9, 9), min_size=4, max_size=4), torque=st.integers(-9, 9), seed=st.integers(0, 99))
 def test_units_do_not_matter(powers: list[int], torque: int, seed: int) -> None:
     """Columns in other units scale the parameters inversely, torque in other units scales them too."""
-    W, y = window(seed=seed)
+    W, y = regression(60, 4, seed=seed)
     scale, unit = 10.0 ** np.array(powers), 10.0**torque
     plain, scaled = fit_of(W, y), fit_of(W * scale, y * unit)
     np.testing.assert_allclose(scaled.theta * scale, plain.theta * unit, rtol=1e-9)
@@ -322,7 +314,7 @@ def test_variance_accounted_for_earns_nothing_with_a_constant() -> None:
 
 
 def test_gradient_through_the_fit_is_finite_difference() -> None:
-    W, y = window(30)
+    W, y = regression(30, 4)
     direction, lags, step = np.random.default_rng(3).normal(size=W.shape), 0.5 ** np.arange(5.0), 1e-6
 
     @jax.jit
@@ -336,7 +328,7 @@ def test_gradient_through_the_fit_is_finite_difference() -> None:
 
 @pytest.mark.parametrize("coloured", [False, True], ids=["white", "coloured"])
 def test_weights_are_a_row_multiplied(coloured: bool) -> None:
-    W, y = window(40, 3)
+    W, y = regression(40, 3)
     random = np.random.default_rng(2)
     weights = np.where(random.random(40) < 0.8, random.exponential(size=40), 0.0)
     root, kept = np.sqrt(weights), weights > 0

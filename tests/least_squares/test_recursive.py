@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from factories.regressions import THETA, regression
 from jaximp.least_squares.recursive import init, recursive_least_squares, step
 
 Numbers = NDArray[np.float64]
-THETA = np.array([0.1, 1.5, 20.0])
-
-
-def recording(n: int = 120, seed: int = 0) -> tuple[Numbers, Numbers]:
-    random = np.random.default_rng(seed)
-    W = random.normal(size=(n, 3)) * np.array([30.0, 3.0, 0.3])
-    return W, W @ THETA + 0.1 * random.normal(size=n)
 
 
 def weighted(W: Numbers, y: Numbers, forgetting: float) -> Numbers:
@@ -27,7 +21,7 @@ def weighted(W: Numbers, y: Numbers, forgetting: float) -> Numbers:
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.999, 0.9, 0.5])
 def test_is_weighted_least_squares_of_the_samples_so_far(forgetting: float) -> None:
-    W, y = recording()
+    W, y = regression(120)
     theta = np.asarray(recursive_least_squares(W, y, forgetting).theta)
     assert theta.shape == (120, 3)
     for k in range(2, 120):
@@ -36,7 +30,7 @@ def test_is_weighted_least_squares_of_the_samples_so_far(forgetting: float) -> N
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.9])
 def test_streamed_steps_are_the_scan(forgetting: float) -> None:
-    W, y = recording(40)
+    W, y = regression(40)
     whole = np.asarray(recursive_least_squares(W, y, forgetting).theta)
     state, streamed, take = init(3), [], jax.jit(step)
     for w, torque in zip(W, y, strict=True):
@@ -47,7 +41,7 @@ def test_streamed_steps_are_the_scan(forgetting: float) -> None:
 
 def late(kind: str) -> tuple[Numbers, int]:
     """Regressors that do not determine all parameters before some sample."""
-    W, _ = recording()
+    W, _ = regression(120)
     match kind:
         case "three samples":
             return W, 2
@@ -71,15 +65,15 @@ def late(kind: str) -> tuple[Numbers, int]:
 )
 def test_nan_until_the_samples_determine_everything(kind: str, forgetting: float) -> None:
     W, first = late(kind)
-    theta = np.asarray(recursive_least_squares(W, W @ THETA, forgetting).theta)
+    theta = np.asarray(recursive_least_squares(W, W @ THETA[:3], forgetting).theta)
     assert np.isnan(theta[:first]).all()
-    np.testing.assert_allclose(theta[first:], np.broadcast_to(THETA, (len(W) - first, 3)), rtol=1e-4)
+    np.testing.assert_allclose(theta[first:], np.broadcast_to(THETA[:3], (len(W) - first, 3)), rtol=1e-4)
 
 
 @pytest.mark.parametrize("hidden", [0.0, 1e6, np.nan], ids=["zero", "huge", "NaN"])
 @pytest.mark.parametrize("forgetting", [1.0, 0.95])
 def test_a_masked_sample_changes_nothing(forgetting: float, hidden: float) -> None:
-    W, y = recording()
+    W, y = regression(120)
     valid = np.random.default_rng(1).random(len(y)) < 0.7
     broken = np.where(valid[:, None], W, hidden), np.where(valid, y, hidden)
     theta = np.asarray(recursive_least_squares(*broken, forgetting, valid=valid).theta)
@@ -90,15 +84,15 @@ def test_a_masked_sample_changes_nothing(forgetting: float, hidden: float) -> No
 
 
 def test_forgetting_follows_a_step_of_the_stiffness() -> None:
-    W, _ = recording(600)
-    truth = np.where(np.arange(600)[:, None] < 300, THETA, THETA * np.array([1, 1, 2]))
+    W, _ = regression(600)
+    truth = np.where(np.arange(600)[:, None] < 300, THETA[:3], THETA[:3] * np.array([1, 1, 2]))
     theta = np.asarray(recursive_least_squares(W, (W * truth).sum(axis=1), 0.95).theta)
     np.testing.assert_allclose(theta[299], truth[299], rtol=1e-6)
     np.testing.assert_allclose(theta[599], truth[599], rtol=1e-4)
 
 
 def test_vmap_is_a_loop_and_the_gradient_is_finite_difference() -> None:
-    W, y = (np.stack(x) for x in zip(*(recording(30, seed) for seed in range(3)), strict=True))
+    W, y = (np.stack(x) for x in zip(*(regression(30, seed=seed) for seed in range(3)), strict=True))
     batch = jax.vmap(lambda W, y: recursive_least_squares(W, y, 0.9).theta)(W, y)
     for k in range(3):
         np.testing.assert_allclose(batch[k], recursive_least_squares(W[k], y[k], 0.9).theta, rtol=1e-9)
@@ -113,7 +107,7 @@ def test_vmap_is_a_loop_and_the_gradient_is_finite_difference() -> None:
 @pytest.mark.parametrize("forgetting", [0.0, -0.5, 1.0001, float("nan")])
 def test_a_forgetting_factor_outside_zero_to_one_is_refused(forgetting: float) -> None:
     with pytest.raises(ValueError, match=r"it must lie in \(0, 1\]"):
-        recursive_least_squares(*recording(), forgetting)
+        recursive_least_squares(*regression(120), forgetting)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +120,7 @@ def test_shapes_that_disagree_are_refused(rows: tuple[int, ...], torque: tuple[i
 
 def test_a_mask_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="valid"):
-        recursive_least_squares(*recording(), valid=np.ones(7, bool))
+        recursive_least_squares(*regression(120), valid=np.ones(7, bool))
 
 
 def test_whole_numbers_are_taken() -> None:
@@ -137,4 +131,4 @@ def test_whole_numbers_are_taken() -> None:
 
 def test_float64_off_is_an_error() -> None:
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
-        recursive_least_squares(*recording())
+        recursive_least_squares(*regression(120))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaximp.cli import main as cli
+from command_line import jaximp
 from jaximp.jobs.job import parse_job, read_job
 from jaximp.jobs.run_trials import identify_trials
 from jaximp.models import BASE_INERTIA, ArmGeometry, PlanarArm
@@ -43,16 +42,6 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     numbers = ("--perturbed", 10, "--unperturbed", 6, "--duration", 1.4)
     assert jaximp("simulate", "arm", "--out", folder, "--format", "csv", *numbers) == 0
     return folder
-
-
-def jaximp(*arguments: object) -> int:
-    """Run the command line in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-        patch.setattr(sys, "argv", ["jaximp", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-    return int(stopped.value.code or 0)
 
 
 @pytest.fixture(scope="module")

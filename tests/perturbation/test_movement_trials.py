@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
+from factories.recordings import cut
 from jaximp.jobs.job import Job, parse_job
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.onsets import find_onset
@@ -302,11 +303,6 @@ def test_noise_of_a_logged_command_is_no_perturbation(recorded: list[Recording],
 
 
 # --- what is refused, and what is said --------------------------------------------------------------------------------
-
-
-def cut(recording: Recording, part: slice) -> Recording:
-    names = ("time", "position", "torque", "valid", "command")
-    return replace(recording, **{name: getattr(recording, name)[part] for name in names})
 
 
 def with_gap(recording: Recording, at: slice) -> Recording:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from factories.recordings import cut
 from jaximp import load_recording, recording_from_arrays, save_recording
 from jaximp.identification import FilterSettings
 from jaximp.least_squares.window import WindowFit
@@ -197,11 +198,11 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
         pytest.param(
             lambda r: [replace(r[0], reference=np.zeros((len(r[0]), 2)))], "trial 1 .0.: no perturbation", id="command"
         ),
-        pytest.param(lambda r: [r[0], shortened(r[1], 300)], "trial 2 .1. lasts from 0 to 0.299 s", id="too short"),
+        pytest.param(lambda r: [r[0], cut(r[1], slice(300))], "trial 2 .1. lasts from 0 to 0.299 s", id="too short"),
         pytest.param(
             lambda r: [replace(r[0], joints=("revolute", "revolute"))], "not a recording of a hand", id="hand"
         ),
-        pytest.param(lambda r: [r[0], resampled(r[1])], "sampled at 500 Hz", id="rate"),
+        pytest.param(lambda r: [r[0], cut(r[1], slice(None, None, 2))], "sampled at 500 Hz", id="rate"),
         pytest.param(lambda r: [gap(r[0])], "trial 1 .0. has a gap at 0.2 s, and its perturb", id="gap"),
         pytest.param(lambda r: [], "no trials", id="none"),
         pytest.param(lambda r: [r[0], late(r[1], 0.05)], "trial 2 moves before its onset", id="late onset"),
@@ -212,16 +213,6 @@ def test_steady_state_is_taken_off(held: HeldTrials) -> None:
 def test_bad_trials_are_named(logged: list[Recording], spoil: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         at_joints(spoil(logged), before=0.15, after=0.35)
-
-
-def shortened(recording: Recording, n: int) -> Recording:
-    names = ("time", "position", "torque", "valid", "reference")
-    return replace(recording, **{name: getattr(recording, name)[:n] for name in names})
-
-
-def resampled(recording: Recording) -> Recording:
-    names = ("time", "position", "torque", "valid", "reference")
-    return replace(recording, **{name: getattr(recording, name)[::2] for name in names})
 
 
 def late(recording: Recording, by: float) -> Recording:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 from scipy.stats import t as student
-from test_identify import JOB, TIME, TRUTH, joint
 
-from jaximp.cli import main as cli
+from command_line import jaximp
+from factories.joints import JOB, TIME, TRUTH, joint
 from jaximp.identification.identify import prepare
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import infer_recording
@@ -278,20 +277,12 @@ def test_sentences_are_for_a_paper(found: Inference) -> None:
     assert "N m/rad (95 % credible interval 19." in line or "N m/rad (95 % credible interval 20." in line
 
 
-def test_the_command_writes_draws_and_a_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_draws_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_recording(stiffening(), tmp_path / "<b>.csv")
     columns = "time = 'time_s'\nposition = 'position_rad'\ntorque = 'torque_Nm'\n"
     text = JOB.replace("recording = {}", f"[recording]\nfile = '<b>.csv'\n{columns}")
     (tmp_path / "job.toml").write_text(text)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    monkeypatch.setattr(
-        sys, "argv", ["jaximp", "posterior", str(tmp_path / "job.toml"), "--out", str(tmp_path / "out")]
-    )
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code in (0, None)
+    assert jaximp("posterior", tmp_path / "job.toml", "--out", tmp_path / "out") == 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
     figures = {"corner.png", "torque.png", "bands.png"}
     assert names == {"posterior.nc", "windows.nc", "summary.json", "report.html", ".jaximp"} | figures

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Float
 from scipy import stats
 
+from factories.posteriors import Linear, chain_run, mode_of, triangle_of
 from jaximp import plots
 from jaximp.posterior import files as posterior_files
 from jaximp.posterior.draws import (
@@ -43,19 +44,6 @@ from paths import ROOT
 EIGHT = ("D11", "D12", "D21", "D22", "l11", "l21", "l22", "log_noise")
 
 
-class Linear(eqx.Module):
-    """`|R [theta; -1]|^2` with Gaussian noise of unknown size, flat in log(noise)."""
-
-    R: Float[Array, "*M q q"]
-    count: Float[Array, "*M"]
-    names: tuple[str, ...] = ("a", "b", "c", "log_noise")
-    units: tuple[str, ...] = ("kg m^2", "N m s/rad", "N m/rad", "1")
-
-    def __call__(self, theta: Array) -> Array:
-        residual = self.R[:, :-1] @ theta[:-1] - self.R[:, -1]
-        return -self.count * theta[-1] - (residual**2).sum() / 2 * jnp.exp(-2 * theta[-1])
-
-
 class Stiffness(eqx.Module):
     """Damping and the factor of K = L L' by the triangle of their residuals; flat in K."""
 
@@ -71,18 +59,6 @@ class Stiffness(eqx.Module):
         volume = 2 * jnp.log(jnp.where(inside, l11, 1)) + jnp.log(jnp.where(inside, l22, 1))
         value = -self.count * theta[7] - squares / 2 * jnp.exp(-2 * theta[7]) + volume
         return jnp.where(inside, value, -jnp.inf)
-
-
-def triangle_of(seed: int, rows: int = 15) -> np.ndarray:
-    """Of correlated columns of unlike units."""
-    random = np.random.default_rng(seed)
-    W = random.normal(size=(rows, 3)) @ np.array([[1, 0.9, 0], [0, 1, 0], [0, 0, 1]]) * [0.01, 1, 50]
-    y = W @ [0.015, 0.7, 60.0] + random.normal(size=rows)
-    return np.linalg.qr(np.column_stack([W, y]), mode="r")
-
-
-def mode_of(R: np.ndarray, count: int) -> np.ndarray:
-    return np.append(np.linalg.solve(R[:3, :3], R[:3, 3]), np.log(abs(R[3, 3]) / np.sqrt(count)))
 
 
 @cache
@@ -397,13 +373,6 @@ def test_laplace_of_the_density_is_the_start() -> None:
 # Chain files
 
 
-def chain_run(path: Path | None, *, seed: int = 0, offset: float = 0.0, **settings: Any) -> Posterior:
-    density = Linear(jnp.asarray(triangle_of(0)) + offset * jnp.eye(4), jnp.asarray(15.0))
-    start = mode_of(triangle_of(0), 15)
-    covariance = exact_posterior(triangle_of(0), 15).covariance
-    return sample_posterior(density, start, covariance=covariance, seed=seed, chain=path, **settings)
-
-
 def test_an_interrupted_run_resumes_to_the_same_result(tmp_path: Path) -> None:
     whole = chain_run(None, ess=3000)
     path = tmp_path / "chain.h5"
@@ -453,12 +422,12 @@ def test_a_run_that_is_killed_resumes(tmp_path: Path) -> None:
         jax.config.update("jax_enable_x64", True)
         from jaximp.posterior import samplers
         samplers.SAVE_EVERY = 0
-        from test_posterior import chain_run
+        from factories.posteriors import chain_run
         from pathlib import Path
         chain_run(Path({file!r}), ess=1e6)
     """
     file = tmp_path / "chain.h5"
-    paths = [str(Path(__file__).parent), str(ROOT)]
+    paths = [str(ROOT / "tests"), str(ROOT)]
     code = textwrap.dedent(program.format(path=paths, file=str(file)))
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as process:
         for _ in range(600):

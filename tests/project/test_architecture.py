@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 from paths import ROOT
 
 PACKAGE = ROOT / "jaximp"
+TESTS = ROOT / "tests"
 
 PACKAGES = (
     "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust",
@@ -61,6 +63,13 @@ def called(module: str) -> Iterator[str]:
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.Call):
             yield ast.unparse(node.func)
+
+
+def test_the_map_is_that_of_the_packages() -> None:
+    """Every package stands in the table, in the order in which they import."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
+    assert tuple(named) == PACKAGES
 
 
 @every_module
@@ -130,3 +139,18 @@ def test_nothing_is_pickled() -> None:
         imported = {alias.name for node in nodes for alias in node.names}
         assert not imported & {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}, path.name
         assert "allow_pickle=True" not in path.read_text(), path.name
+
+
+def test_the_tests_stand_in_the_folders_of_the_packages() -> None:
+    """But for those of the project as a whole, and what tests share: `factories` and the modules beside it."""
+    folders = {path.parent.name for path in TESTS.glob("*/*.py")}
+    assert folders - {"project", "factories"} <= {*PACKAGES}
+
+
+def test_no_test_file_imports_from_another() -> None:
+    """Also not in a program that it starts."""
+    files = sorted(TESTS.rglob("test_*.py"))
+    assert len({path.name for path in files}) == len(files), "two test files share a name"
+    for path in TESTS.rglob("*.py"):
+        found = re.findall(r"^\s*(?:from|import)\s+([\w.]*\btest_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert not found, f"{path.name} imports from {found[0]}: move what both need into tests/factories"

@@ -8,7 +8,6 @@ import re
 import runpy
 
 import pytest
-from test_architecture import PACKAGES
 
 from paths import ROOT
 
@@ -49,10 +48,3 @@ def test_tests_of_the_equations_exist(file: str) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
     assert {row[2] for row in ROWS if row[1] == file} <= defined
-
-
-def test_the_map_is_that_of_the_packages() -> None:
-    """Every package stands in the table, in the order in which they import."""
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    named = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
-    assert tuple(named) == PACKAGES

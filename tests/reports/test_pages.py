@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_plots import JOB, identified, recording, repeat
 
 from browser import Browser, browser, executable
+from factories.estimates import JOB, identified, recording, repeat
 from jaximp import plots
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job

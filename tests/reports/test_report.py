@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from test_plots import JOB, identified, recording, without_trust
 
+from factories.estimates import JOB, identified, recording, without_trust
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import Job, parse_job
 from jaximp.reports import estimates as report

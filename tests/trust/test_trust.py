@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from factories.joints import MULTISINE, TRUTH, joint, sines
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify_recording
@@ -26,8 +27,6 @@ Numbers = NDArray[np.float64]
 # ---- The case of NUMERICS.md: the condition number alone does not tell a still arm from a moving one.
 
 TIME = np.arange(6000) / 1000
-INERTIA, DAMPING, STIFFNESS = 0.1, 1.5, 20.0
-MULTISINE = ((0.2, 1.1, 0.0), (0.1, 2.9, 0.5), (0.04, 6.3, 1.0))
 ONE_FREQUENCY = ((0.2, 1.1, 0.0),)
 
 JOB = """
@@ -57,17 +56,11 @@ def identified(
     position_noise: float = 1e-5,
     order: int = 2,
 ) -> Estimates:
-    random = np.random.default_rng(seed)
     moving = ((TIME < 2) | (TIME >= 4)) if still else np.ones(len(TIME), bool)
-    q, dq, ddq = (
-        moving
-        * sum(a * (2 * np.pi * f) ** k * np.sin(2 * np.pi * f * TIME + phase + k * np.pi / 2) for a, f, phase in lines)
-        for k in range(3)
-    )
-    torque = INERTIA * ddq + DAMPING * dq + STIFFNESS * q + random.normal(0, torque_noise, len(TIME))
+    noise = {"seed": seed, "torque_noise": torque_noise, "position_noise": position_noise}
+    recording = joint(TIME, moving * sines(TIME, lines), **noise, offset_torque=0.0)
     job = parse_job(JOB.format(order=order, decimate="" if decimate is None else f"decimate = {decimate}"))
-    measured = q + position_noise * random.normal(size=len(TIME))
-    return identify_recording(job, recording_from_arrays(TIME, measured, torque))[0]
+    return identify_recording(job, recording)[0]
 
 
 def inside(estimates: Estimates) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -79,7 +72,7 @@ def inside(estimates: Estimates) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 def beyond_four_errors(estimates: Estimates) -> NDArray[np.bool_]:
     """Windows whose stiffness is further from the truth than four of its standard errors."""
     theta, stderr = np.asarray(estimates.fit.theta)[:, 2], np.asarray(estimates.fit.stderr)[:, 2]
-    return np.abs(theta - STIFFNESS) > 4 * stderr
+    return np.abs(theta - TRUTH["stiffness"]) > 4 * stderr
 
 
 noises = pytest.mark.parametrize("torque_noise", [0.02, 0.2, 2.0], ids=lambda level: f"torque noise {level:g} N m")
@@ -286,10 +279,9 @@ def test_a_larger_motion_with_its_own_noise_is_no_poor_fit() -> None:
     """The residual grows with the motion, the unexplained share does not: the model is as good as before."""
     random = np.random.default_rng(3)
     loud = 1 + 5 / (1 + np.exp(-10 * (TIME - 3)))
-    lines = sum(a * np.sin(2 * np.pi * f * TIME + p) for a, f, p in MULTISINE)
-    q = 0.2 * loud * np.asarray(lines)
+    q = 0.2 * loud * sines(TIME)[0]
     dq, ddq = np.gradient(q, TIME), np.gradient(np.gradient(q, TIME), TIME)
-    clean = INERTIA * ddq + DAMPING * dq + STIFFNESS * q
+    clean = TRUTH["inertia"] * ddq + TRUTH["damping"] * dq + TRUTH["stiffness"] * q
     torque = clean + 0.02 * loud * np.std(clean[TIME < 3]) * random.normal(size=len(TIME))
     job = parse_job(JOB.format(order=8, decimate=""))
     estimates = identify_recording(job, recording_from_arrays(TIME, q, torque))[0]
