@@ -1,4 +1,4 @@
-"""A linear model whose posterior is known exactly, and chains that sample it."""
+"""A linear model whose posterior is known exactly, chains that sample it, and whether they agree with it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaximp.posterior.draws import Posterior, exact_posterior
+from jaximp.posterior.draws import Posterior, effective_samples, exact_posterior
 from jaximp.posterior.samplers import sample_posterior
 
 
@@ -44,3 +44,20 @@ def chain_run(path: Path | None, *, seed: int = 0, offset: float = 0.0, **settin
     start = mode_of(triangle_of(0), 15)
     covariance = exact_posterior(triangle_of(0), 15).covariance
     return sample_posterior(density, start, covariance=covariance, seed=seed, chain=path, **settings)
+
+
+def means_agree(posterior: Posterior, mean: np.ndarray, errors: float = 4) -> bool:
+    """Within so many Monte Carlo standard errors, from the effective samples of the means themselves."""
+    chains = posterior.chains.transpose(2, 0, 1)
+    error = posterior.samples.std(axis=0) / np.sqrt(effective_samples(chains))
+    return bool((np.abs(posterior.mean - mean) < errors * error).all())
+
+
+def variances_agree(posterior: Posterior, covariance: np.ndarray, mean: np.ndarray, errors: float = 4) -> bool:
+    """All elements of the covariance, each as the mean of a product."""
+    away = posterior.chains - mean
+    p = len(mean)
+    products = np.stack([away[..., i] * away[..., j] for i in range(p) for j in range(i + 1)])
+    expected = np.array([covariance[i, j] for i in range(p) for j in range(i + 1)])
+    error = products.std(axis=(1, 2)) / np.sqrt(effective_samples(products))
+    return bool((np.abs(products.mean(axis=(1, 2)) - expected) < errors * error).all())

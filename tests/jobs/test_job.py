@@ -95,7 +95,7 @@ def arm_of(keys: str) -> PlanarArm:
 
 
 def test_an_arm_has_one_table_of_keys() -> None:
-    """The same as beside [trials], for which see test_movement_trials.py; each kind of job says which are not its."""
+    """The same as beside [trials], for which see test_trials_job.py; each kind of job says which are not its."""
     assert arm_of("") == PlanarArm(impedance=False)
     assert arm_of("equilibrium = [0.1, 1.0]\ninertia = false") == PlanarArm((0.1, 1.0), inertia=False)
     tied = PlanarArm(impedance=False, gravity=True, length=0.3)

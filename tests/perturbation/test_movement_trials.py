@@ -12,23 +12,16 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from scipy.signal import savgol_filter
 
 from factories.recordings import cut
-from jaximp.jobs.job import Job, parse_job
+from jaximp.jobs.job import parse_job
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.onsets import find_onset
 from jaximp.perturbation.reading import read_trials
 from jaximp.perturbation.sensors import judge_sensors
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
-from jaximp.recordings.load import (
-    load_recording,
-    load_trial_table,
-    recording_from_arrays,
-    save_recording,
-    save_trial_table,
-)
-from jaximp.signals import savitzky_golay, savitzky_golay_gain, savitzky_golay_half_length
+from jaximp.recordings.load import load_trial_table, save_recording, save_trial_table
+from jaximp.signals import savitzky_golay, savitzky_golay_gain
 from jaximp.simulation.arm_recordings import Sensors, arm_movements, as_recordings
 from jaximp.simulation.neuromuscular import ANGLES, POSTURES, NeuromuscularArm, Reaches, hold_posture
 from jaximp.types import Recording
@@ -53,54 +46,6 @@ def recorded(simulated: Reaches) -> list[Recording]:
 @pytest.fixture(scope="module")
 def pushed(simulated: Reaches) -> np.ndarray:
     return np.flatnonzero(np.abs(simulated.movements.command).max(axis=(1, 2)) > 0)
-
-
-# --- the differentiator -----------------------------------------------------------------------------------------------
-
-
-def test_length_of_the_filter_follows_from_its_cutoff() -> None:
-    """50 Hz at 4 kHz are 203 samples, and there the velocity is down by 3 dB."""
-    half = savitzky_golay_half_length(4000.0, 50.0, 7)
-    assert half == 101
-    t = np.arange(8000) / 4000
-    passed = savitzky_golay(np.sin(2 * np.pi * 50 * t), 4000.0, 1)[half:-half].std() * np.sqrt(2) / (2 * np.pi * 50)
-    assert 20 * np.log10(passed) == pytest.approx(-3, abs=0.1)
-
-
-@pytest.mark.parametrize("derivative", [0, 1, 2, 3])
-def test_filter_is_that_of_scipy_where_scipy_is_sound(derivative: int) -> None:
-    x = np.random.default_rng(0).normal(size=(200, 2))
-    half = savitzky_golay_half_length(500.0, 50.0, 5)
-    expected = savgol_filter(x, 2 * half + 1, 5, deriv=derivative, delta=1 / 500, axis=0)
-    np.testing.assert_allclose(
-        savitzky_golay(x, 500.0, derivative, order=5), expected, atol=1e-8 * np.abs(expected).max()
-    )
-
-
-@pytest.mark.parametrize("derivative", [0, 1, 2, 3])
-def test_polynomials_are_differentiated_exactly_also_at_the_ends(derivative: int) -> None:
-    """With 203 samples, for which scipy's powers of the index are too many digits apart."""
-    t = np.arange(1000) / 4000
-    polynomial = np.polynomial.Polynomial([1.0, -2, 30, 4, -500, 60, 7, -800])
-    found = savitzky_golay(polynomial(t), 4000.0, derivative)
-    expected = polynomial.deriv(derivative)(t) if derivative else polynomial(t)
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
-
-
-def test_gain_is_what_white_noise_becomes() -> None:
-    noise = np.random.default_rng(0).normal(size=400_000)
-    for derivative in (0, 3):
-        found = savitzky_golay(noise, 4000.0, derivative)[200:-200].std()
-        assert found == pytest.approx(savitzky_golay_gain(4000.0, derivative), rel=0.05)
-
-
-def test_filters_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ValueError, match="between 0 and 2000"):
-        savitzky_golay_half_length(4000.0, 2500.0)
-    with pytest.raises(ValueError, match="lower one of them"):
-        savitzky_golay_half_length(4000.0, 1900.0, order=15)
-    with pytest.raises(ValueError, match="too few"):
-        savitzky_golay(np.zeros(100), 4000.0)
 
 
 # --- round trips ------------------------------------------------------------------------------------------------------
@@ -432,166 +377,3 @@ def test_coarse_encoders_are_seen(simulated: Reaches) -> None:
     assert "an encoder in steps of 100 um" in notes[0]
     assert "will not work; use output error" in notes[0]
     assert re.search(r"noise of 0.(5|49) N is \d+ % of what they change it by: perturb harder", notes[1])
-
-
-# --- the job ----------------------------------------------------------------------------------------------------------
-
-JOB = """
-[trials]
-file = "t.parquet"
-time = "time_s"
-position = ["x", "y"]
-torque = ["fx", "fy"]
-command = ["px", "py"]
-[model.arm]
-lengths = [0.29, 0.34]
-"""
-
-
-def test_a_job_of_trials_has_defaults() -> None:
-    job = parse_job(JOB)
-    assert job.trials is not None
-    assert (job.trials.task, job.trials.window, job.window.length) == ("movement", 0.115, 0.115)
-    assert job.trials.handle is None
-    assert job.model.arm is not None
-    assert job.model.arm.geometry().lengths == (0.29, 0.34)
-    with pytest.raises(ValueError, match=r"this job has .trials. and no .recording."):
-        job.load()
-
-
-def test_a_job_of_trials_has_settings() -> None:
-    text = JOB.replace("[model.arm]", "trigger = { axis = 2, position = 0.4 }\ncutoff = [2, 30]\nonset = [0.5, nan]\n"
-                       "method = 'gomi_kawato'\n[trials.handle]\nmass = [4, 6]\ndamping = [20, 20]\n"
-                       "[model.arm]\nshoulder = [0.1, -0.2]\n"
-                       "inertia = { upper_arm = 0.2, forearm = 0.07, coupling = 0.08 }\n"
-                       "inertia_stderr = { upper_arm = 0.01, forearm = 0.02, coupling = 0.03 }")  # fmt: skip
-    trials, arm = parse_job(text).trials, parse_job(text).model.arm
-    assert trials is not None
-    assert arm is not None
-    assert trials.handle is not None
-    assert (trials.cutoff, trials.handle.mass, trials.method) == ([2.0, 30.0], [4.0, 6.0], "gomi_kawato")
-    assert trials.trigger is not None
-    assert (trials.trigger.axis, trials.trigger.position) == (2, 0.4)
-    assert arm.geometry().shoulder == (0.1, -0.2)
-    assert arm.known_inertia is not None
-    assert arm.known_stderr is not None
-    np.testing.assert_allclose(arm.known_inertia.borner, [0.2, 0.07, 0.08])
-    np.testing.assert_allclose(arm.known_stderr.borner, [0.01, 0.02, 0.03])
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('file = "t.parquet"', "", "needs either 'files' (one a trial) or 'file'"),
-        ('file = "t.parquet"', 'file = "a"\nfiles = "b"', "one of the two"),
-        ('file = "t.parquet"', 'files = "b"\ntrial = "n"', "leave it out beside 'files'"),
-        ('file = "t.parquet"', "files = 3", "trials.files is 3: it must be text or a list of text"),
-        ('file = "t.parquet"', "files = []", "needs either 'files'"),
-        ("torque", "force", "calls the force on the hand 'torque'"),
-        ("torque", "torgue", "unknown key 'torgue': did you mean 'torque'"),
-        ("[trials]", "[trial]", "unknown key 'trial': did you mean 'trials'"),
-        ("[trials]", "[trials]\ntask = 'movment'", "trials.task is 'movment': did you mean 'movement'"),
-        ("[trials]", "[trials]\nwindow = 115", "were milliseconds meant?"),
-        ("[trials]", "[trials]\nwindow = -1", "trials.window is -1.0: it must be a number above zero"),
-        ("[trials]", "[trials]\ncutoff = 2", "trials.cutoff is 2: it must be a list of numbers"),
-        ("[trials]", "[trials]\ncutoff = [2, 3, 4]", "trials.cutoff is [2.0, 3.0, 4.0]: it must be two numbers"),
-        ("[trials]", "[trials]\nonset = 'x'", "trials.onset is 'x': it must be a number or a list of numbers"),
-        ("[trials]", "[trials]\njoint = 'revolute'", "unknown key 'joint'"),
-        ("[trials]", "[trials]\nmapping = {}", "unknown key 'mapping'"),
-        (
-            "[trials]",
-            "[trials]\nhandle = { mas = [1, 2] }",
-            "[trials.handle] has an unknown key 'mas': did you mean 'mass'",
-        ),
-        (
-            "[trials]",
-            "[trials]\nhandle = { mass = [1], damping = [1, 2] }",
-            "trials.handle.mass is [1.0]: it must be two numbers",
-        ),
-        (
-            "[trials]",
-            "[trials]\nhandle = { mass = [1, 1], damping = [1, 2], own_mass = -1 }",
-            "trials.handle.own_mass is -1.0",
-        ),
-        ("[trials]", "[trials]\nhandle = { mass = [1, 1] }", "[trials.handle] has no 'damping': add it"),
-        ("[trials]", "[trials]\nhandle = 3", "trials.handle is 3: it must be a table"),
-        ("[trials]", "[trials]\ntrigger = { axis = 3, position = 0 }", "trials.trigger.axis is 3: it must be 1 or 2"),
-        ("[trials]", "[trials]\ntrigger = { axis = 2 }", "[trials.trigger] has no 'position'"),
-        ("lengths = [0.29, 0.34]", "length = 0.29", "lengths is [0.29]: it must be two finite numbers"),
-        ("lengths = [0.29, 0.34]", "lenths = [0.29, 0.34]", "unknown key 'lenths': did you mean 'lengths'"),
-        ("lengths = [0.29, 0.34]", "lengths = [0.29, -1]", "lengths is"),
-        ("lengths = [0.29, 0.34]", "", "[model.arm] has no 'lengths'"),
-        ("[model.arm]", "[model.arm]\ninertia = [1, 2]", "numbers alone do not say which is which: write inertia = {"),
-        (
-            "[model.arm]",
-            "[model.arm]\ninertia = [0.19, 0.07, 0.08]",
-            "write inertia = { upper_arm = 0.19, forearm = 0.07, coupling = 0.08 }, if they are I_1 + m_2 l1^2, I_2, "
-            "m_2 c_2 l1 in kg m^2",
-        ),
-        ("[model.arm]", "[model.arm]\ninertia_stderr = [1, 2, 3]", "write inertia_stderr = { upper_arm = 1,"),
-        (
-            "[model.arm]",
-            "[model.arm]\ninertia_stderr = { upper_arm = 1, forearm = 1, coupling = 1 }",
-            "needs model.arm.inertia",
-        ),
-        (
-            "[model.arm]",
-            "[model.arm]\ninertia = { upper_arm = 1, forearm = 1, coupling = 0 }",
-            "'coupling': 0.0}: all must be numbers above zero",
-        ),
-        (
-            "[model.arm]",
-            "[model.arm]\ninertia = { upper_arm = 1, forearm = 1 }",
-            "[model.arm.inertia] has no 'coupling': add it",
-        ),
-        ("[model.arm]", "[model.arm]\ninertia = true", "here write what it is, inertia = { upper_arm"),
-        ("[model.arm]", "[model.arm]\ngravity = true", "model.arm.gravity is for a [recording] of the joints"),
-        ("[model.arm]", "[model.arm]\nlength = 0.3", "model.arm.length and model.arm.lengths both stand there"),
-        ("[model.arm]\nlengths = [0.29, 0.34]", "[model]\nhuman = true", "add [model.arm] with its lengths"),
-        ("[model.arm]", "[model]\nhuman = true\n[model.arm]", "unknown key 'human'"),
-        ("[trials]", "[window]\nlength = 1\n[trials]", "leave out 'window'"),
-        ("[trials]", "[recording]\n[trials]", "leave out 'recording'"),
-        ("[trials]", "[trust]\nmin_vaf = 75\n[trials]", "trust.min_vaf is 75.0: it is a share"),
-    ],
-)
-def test_what_is_wrong_in_a_job_is_named(old: str, new: str, message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        parse_job(JOB.replace(old, new, 1))
-    assert "\n" not in str(caught.value)
-
-
-def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
-    def job(files: str) -> Job:
-        return parse_job(JOB.replace('file = "t.parquet"', f'files = "{files}"'), tmp_path)
-
-    (tmp_path / "empty").mkdir()
-    for files, message in {"*.csv": "no file matches", "empty": "has no file of a known kind"}.items():
-        with pytest.raises(ValueError, match=message):
-            job(files).files()
-    missing = job("none.csv").trials
-    assert missing is not None
-    with pytest.raises(FileNotFoundError, match="there is no such file"):
-        missing.load()
-
-
-def test_one_file_has_one_time_base(tmp_path: Path) -> None:
-    np.savez(tmp_path / "t.npz", q=np.random.default_rng(0).normal(size=(99, 2)), f=np.zeros((50, 2)))
-    columns: dict[str, Any] = {"sample_rate": 1000.0, "joint": "prismatic", "position": "q"}
-    with pytest.raises(ValueError, match=r"'q\[1\]' has 99 samples, but 'f\[1\]' has 50; .*one time base"):
-        load_recording(tmp_path / "t.npz", torque="f", **columns)
-    with pytest.raises(ValueError, match="all columns of a recording come from one file"):
-        load_recording(tmp_path / "t.npz", torque={"file": "other.npz", "column": "f"}, **columns)
-
-
-def test_a_command_is_a_force(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    recording = recording_from_arrays(
-        np.arange(9) / 10, rng.normal(size=9), rng.normal(size=9), command=rng.normal(size=9)
-    )
-    save_recording(recording, tmp_path / "r.csv")
-    columns: dict[str, Any] = {"time": "time_s", "position": "position_rad", "torque": "torque_Nm"}
-    command = {"column": "command_Nm", "unit": "mN m"}
-    read = load_recording(tmp_path / "r.csv", command=command, gear_ratio=2.0, **columns)
-    np.testing.assert_allclose(read.command, 2e-3 * np.asarray(recording.command))
-    with pytest.raises(ValueError, match="command: unit 'deg' does not convert"):
-        load_recording(tmp_path / "r.csv", command=command | {"unit": "deg"}, **columns)

@@ -1,161 +1,23 @@
-"""Reading recordings: units, readers, sampling, and what is refused."""
+"""Recordings: units, saving, the table of a job file, real ones, and what is refused."""
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from factories.recordings import CHANNELS, MAPPING, assert_equal, matches, signals, write_csv
 from jaximp.recordings.load import load_recording, recording_from_arrays, recording_from_mapping, save_recording
 from jaximp.types import Recording
-
-CHANNELS = ("position", "torque", "velocity", "acceleration", "force", "reference", "command")
-MAPPING = {"time": "t", "position": "q", "torque": "tau"}
-
-
-def signals(n: int = 50, rate: float = 100.0) -> dict[str, np.ndarray]:
-    t = np.arange(n) / rate
-    return {"t": t, "q": np.sin(5 * t), "tau": np.cos(3 * t) - 0.5}
-
-
-def write_csv(path: Path, columns: dict[str, Any], delimiter: str = ",") -> Path:
-    rows = zip(*columns.values(), strict=True)
-    lines = [delimiter.join(columns), *(delimiter.join(str(value) for value in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
-
-
-def matches(text: str) -> str:
-    """A pattern for an error that consists of one line and contains `text`."""
-    return rf"\A[^\n]*{re.escape(text)}[^\n]*\Z"
-
-
-def assert_equal(one: Recording, other: Recording) -> None:
-    assert one.joints == other.joints
-    for channel in ("time", "valid", *CHANNELS):
-        np.testing.assert_array_equal(getattr(one, channel), getattr(other, channel), err_msg=channel)
-
-
-# --- readers ----------------------------------------------------------------------------------------------------------
-
-
-def nested_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    scipy.io.savemat(path, {"data": {"inner": columns}})
-    return {key: f"data.inner.{column}" for key, column in MAPPING.items()}
-
-
-def row_vector_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    scipy.io.savemat(path, columns, oned_as="row")
-    return MAPPING
-
-
-def new_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in columns.items():
-            file[f"data/{name}"] = values[None, :]  # MATLAB's (N, 1) is (1, N) in HDF5
-    return {key: f"data.{column}" for key, column in MAPPING.items()}
-
-
-def hdf5(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    with h5py.File(path, "w") as file:
-        for name, values in columns.items():
-            file[f"run/{name}"] = values
-    return {key: f"run/{column}" for key, column in MAPPING.items()}
-
-
-def npz(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    np.savez(path, **columns)
-    return MAPPING
-
-
-def parquet(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    pyarrow.parquet.write_table(pyarrow.table({**columns, "comment": ["x"] * len(columns["t"])}), path)
-    return MAPPING
-
-
-def text_file(delimiter: str) -> Callable[[Path, dict[str, np.ndarray]], dict[str, Any]]:
-    def write(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
-        write_csv(path, {f" {name}": values for name, values in columns.items()}, delimiter)
-        return MAPPING
-
-    return write
-
-
-@pytest.mark.parametrize(
-    ("file", "write"),
-    [
-        pytest.param("a.csv", text_file(","), id="csv-comma"),
-        pytest.param("a.txt", text_file(";"), id="txt-semicolon"),
-        pytest.param("a.TSV", text_file("\t"), id="tsv-tab"),
-        pytest.param("a.parquet", parquet, id="parquet"),
-        pytest.param("a.mat", nested_mat, id="mat-v5-struct"),
-        pytest.param("a.mat", row_vector_mat, id="mat-v5-row-vectors"),
-        pytest.param("a.mat", new_mat, id="mat-v7.3"),
-        pytest.param("a.h5", hdf5, id="hdf5"),
-        pytest.param("a.npz", npz, id="npz"),
-    ],
-)
-def test_every_format_gives_the_same_recording(tmp_path: Path, file: str, write: Callable[..., dict[str, Any]]) -> None:
-    columns = signals()
-    mapping = write(tmp_path / file, columns)
-    recording = load_recording(tmp_path / file, **mapping)
-    assert_equal(recording, recording_from_arrays(columns["t"], columns["q"], columns["tau"]))
-    assert recording.name == "a"
-    assert recording.notes == ()
-    for channel in ("time", "position", "torque", "valid"):
-        array = getattr(recording, channel)
-        assert array.flags.c_contiguous
-        assert not array.flags.writeable
-
-
-def write_matrix_mat(path: Path, values: dict[str, np.ndarray]) -> None:
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, array in values.items():
-            file[name] = np.atleast_2d(array).T
-
-
-@pytest.mark.parametrize(
-    ("file", "write"),
-    [
-        pytest.param("a.mat", scipy.io.savemat, id="mat-v5"),
-        pytest.param("a.mat", write_matrix_mat, id="mat-v7.3"),
-        pytest.param("a.npz", lambda path, values: np.savez(path, **values), id="npz"),
-    ],
-)
-def test_matrix_is_a_channel_of_several_joints_and_the_rate_is_a_variable(
-    tmp_path: Path, file: str, write: Callable[..., None]
-) -> None:
-    q = np.random.default_rng(0).normal(size=(20, 2))
-    write(tmp_path / file, {"q": q, "tau": 3 * q, "fs": np.array(0.25)})
-    rate = {"column": "fs", "unit": "kHz"}
-    recording = load_recording(tmp_path / file, sample_rate=rate, position="q", torque=["tau"])
-    np.testing.assert_array_equal(recording.position, q)
-    np.testing.assert_array_equal(recording.torque, 3 * q)
-    np.testing.assert_allclose(recording.time, np.arange(20) / 250, rtol=1e-14)
-    assert recording.sample_rate == pytest.approx(250)
-    assert recording.joints == ("revolute", "revolute")
-
-
-def test_integer_columns_become_float64(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", {"t": range(5), "q": [1, 2, 3, 2, 1], "tau": [0, 1, 0, 1, 0]})
-    recording = load_recording(path, **MAPPING, name="integers")
-    assert recording.position.dtype == np.float64
-    assert recording.name == "integers"
-
 
 # --- units ------------------------------------------------------------------------------------------------------------
 
@@ -300,109 +162,6 @@ def test_saving_to_an_unknown_format_names_the_known_ones(tmp_path: Path) -> Non
     assert os.listdir(tmp_path) == []
 
 
-# --- sampling ---------------------------------------------------------------------------------------------------------
-
-
-@given(
-    size=st.integers(10, 200),
-    rate=st.sampled_from([1.0, 60.0, 1000.0, 1024.0, 2000 / 3]),
-    start=st.sampled_from([0.0, -3.3, 1.7e9]),
-    data=st.data(),
-)
-@settings(max_examples=60, deadline=None, derandomize=True)
-def test_missing_rows_are_masked_and_the_others_unchanged(
-    size: int, rate: float, start: float, data: st.DataObject
-) -> None:
-    inner = st.integers(1, size - 2)
-    missing = data.draw(st.sets(inner, max_size=size // 4))
-    kept = np.setdiff1d(np.arange(size), list(missing))
-    t, q = start + np.arange(size) / rate, np.random.default_rng(0).normal(size=size)
-    recording = recording_from_arrays(t[kept], q[kept], -q[kept])
-    assert len(recording) == size
-    np.testing.assert_allclose(recording.time, t, rtol=0, atol=1e-3 / rate)
-    np.testing.assert_array_equal(np.flatnonzero(recording.valid), kept)
-    np.testing.assert_array_equal(recording.position[kept, 0], q[kept])
-    assert np.isnan(recording.torque[~recording.valid]).all()
-    assert len(recording.notes) == bool(missing)
-
-
-@pytest.mark.parametrize(
-    ("rate", "digits", "noted"),
-    [
-        pytest.param(1000, 3, False, id="1kHz-to-ms"),
-        pytest.param(1024, 6, False, id="1024Hz-to-us"),
-        pytest.param(1024, 4, True, id="1024Hz-to-0.1ms"),
-        pytest.param(100.4, 3, True, id="100.4Hz-to-ms"),
-        pytest.param(600, 3, True, id="600Hz-to-ms"),
-    ],
-)
-def test_rounded_stamps_are_even(rate: float, digits: int, noted: bool) -> None:
-    t = np.arange(100_000) / rate
-    recording = recording_from_arrays(np.round(t, digits), np.sin(t), np.cos(t))
-    np.testing.assert_array_equal(recording.position[:, 0], np.sin(t))
-    assert recording.sample_rate == pytest.approx(rate, rel=1e-6)
-    assert recording.valid.all()
-    assert [note for note in recording.notes if "rounded to" in note] == list(recording.notes)
-    assert len(recording.notes) == noted
-
-
-def test_stamps_rounded_until_they_repeat_point_to_the_sample_rate() -> None:
-    t = np.round(np.arange(1000) / 1024, 3)
-    with pytest.raises(ValueError, match=matches("row 23: the time stamp 0.021 s repeats the one before")) as caught:
-        recording_from_arrays(t, np.sin(t), np.cos(t))
-    assert "give 'sample_rate' instead" in str(caught.value)
-
-
-def test_small_jitter_is_not_interpolated() -> None:
-    k = np.arange(1000)
-    t = 0.005 * k + np.random.default_rng(0).uniform(-4e-5, 4e-5, 1000)
-    recording = recording_from_arrays(t, np.sin(t), np.cos(t))
-    np.testing.assert_array_equal(recording.position[:, 0], np.sin(t))
-    np.testing.assert_allclose(np.diff(recording.time), recording.time[1] - recording.time[0], rtol=1e-9)
-    assert recording.notes == ()
-
-
-def test_uneven_sampling_is_interpolated_and_gaps_are_masked() -> None:
-    rng = np.random.default_rng(0)
-    t = np.cumsum(rng.uniform(0.8e-3, 1.2e-3, 5000))
-    t[3000:] += 0.5
-    recording = recording_from_arrays(t, np.sin(8 * t), np.cos(8 * t))
-    grid, valid = recording.time, recording.valid
-    median = np.median(np.diff(t))
-    np.testing.assert_allclose(np.diff(grid), median, rtol=1e-3)
-    np.testing.assert_array_equal(valid, (grid <= t[2999]) | (grid >= t[3000]))
-    error = np.abs(recording.position[:, 0] - np.sin(8 * grid))[valid]
-    assert np.quantile(error, 0.99) < 1e-5
-    assert error.max() < 2e-3  # beside the gap, where the slope is not known
-    uneven, gap = recording.notes
-    assert re.match(
-        r"the sampling is uneven \(4999 intervals from 0\.0008\S* to 0\.50\S* s\): resampled .* Hz$", uneven
-    )
-    assert re.match(
-        r"1 gap in the time stamps \(longest 0\.50\S* s, after row 3000\): the samples inside are masked$", gap
-    )
-
-
-@pytest.mark.parametrize("jitter", [0.0, 2e-4], ids=["even", "uneven"])
-def test_nan_is_masked_and_counted(jitter: float) -> None:
-    t = np.arange(100) / 100 + jitter * np.sin(np.arange(100))
-    q, tau = np.sin(5 * t), np.cos(5 * t)
-    q[[0, 50]], tau[50:53] = np.nan, np.nan
-    recording = recording_from_arrays(t, q, tau)
-    grid = recording.time
-    unmeasured = (grid < t[1] - 1e-9) | ((grid > t[49] + 1e-9) & (grid < t[53] - 1e-9))
-    np.testing.assert_array_equal(~recording.valid, unmeasured)
-    assert np.isnan(recording.torque[unmeasured]).all()
-    assert "4 of 100 samples are masked because of NaN in 'position' (2), 'torque' (3)" in recording.notes
-    assert len(recording.notes) == 1 + (jitter > 0)
-
-
-def test_one_resting_joint_is_noted() -> None:
-    t = np.arange(100) / 100
-    recording = recording_from_arrays(t, np.c_[np.sin(t), 0.3 + 0 * t], np.c_[np.sin(t), np.cos(t)])
-    assert recording.notes == ("column 'position[2]' is constant (0.3): the joint did not move",)
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -510,63 +269,6 @@ def test_a_stated_unit_wins_over_the_name(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(recording.position[:, 0], columns["q"] * DEG)
 
 
-@pytest.mark.parametrize(
-    ("file", "write"),
-    [("a.parquet", parquet), ("a.mat", row_vector_mat), ("a.mat", new_mat), ("a.h5", hdf5), ("a.npz", npz)],
-    ids=["parquet", "mat-v5", "mat-v7.3", "hdf5", "npz"],
-)
-@pytest.mark.parametrize("kept", [0.0, 0.1, 0.7])
-def test_damaged_files(tmp_path: Path, file: str, write: Callable[..., dict[str, Any]], kept: float) -> None:
-    path = tmp_path / file
-    mapping = write(path, signals(2000))
-    content = path.read_bytes()
-    path.write_bytes(content[: int(kept * len(content))])
-    # A MATLAB v5 file that ends early can look like one with fewer variables.
-    with pytest.raises(ValueError, match=r"\A[^\n]*(cannot be read as|is not there|it was cut)[^\n]*\Z") as caught:
-        load_recording(path, **mapping)
-    assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", **signals() | {"q": np.array([{}] * 50)})
-    with pytest.raises(ValueError, match=matches("holds Python objects, which are never unpickled")):
-        load_recording(tmp_path / "a.npz", **MAPPING)
-
-
-def test_other_bad_files(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=matches("there is no such file")):
-        load_recording(tmp_path / "absent.csv", **MAPPING)
-    (tmp_path / "a.xlsx").write_bytes(b"")
-    with pytest.raises(ValueError, match=matches("use one of: .csv, .txt, .tsv, .parquet, .mat")):
-        load_recording(tmp_path / "a.xlsx", **MAPPING)
-    (tmp_path / "empty.csv").write_bytes(b"")
-    with pytest.raises(ValueError, match=matches("is empty; the first line must name the columns")):
-        load_recording(tmp_path / "empty.csv", **MAPPING)
-    (tmp_path / "noise.csv").write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match=matches("is not UTF-8 text")):
-        load_recording(tmp_path / "noise.csv", **MAPPING)
-    (tmp_path / "latin.csv").write_bytes("t,q°,tau\n".encode("latin1"))
-    with pytest.raises(ValueError, match=matches("is not UTF-8 text; save it with that encoding")):
-        load_recording(tmp_path / "latin.csv", **MAPPING)
-    (tmp_path / "twice.csv").write_text("t,q,q,tau\n0,1,2,3\n")
-    with pytest.raises(ValueError, match=matches("column 'q' appears more than once")):
-        load_recording(tmp_path / "twice.csv", **MAPPING)
-    pyarrow.parquet.write_table(pyarrow.table({"t": ["a"], "q": [1], "tau": [1]}), tmp_path / "text.parquet")
-    with pytest.raises(ValueError, match=matches("column 't' holds string, not numbers")):
-        load_recording(tmp_path / "text.parquet", **MAPPING)
-
-
-@given(content=st.binary(max_size=200), extension=st.sampled_from(["csv", "parquet", "mat", "h5", "npz"]))
-@settings(max_examples=150, deadline=None, derandomize=True)
-def test_arbitrary_bytes_give_one_line(
-    tmp_path_factory: pytest.TempPathFactory, content: bytes, extension: str
-) -> None:
-    path = tmp_path_factory.getbasetemp() / f"noise.{extension}"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"\A[^\n]*\Z"):
-        load_recording(path, **MAPPING)
-
-
 # --- the table of a job file ------------------------------------------------------------------------------------------
 
 
@@ -592,6 +294,29 @@ def test_mapping_of_a_job_file(tmp_path: Path) -> None:
 def test_bad_tables(tmp_path: Path, table: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=matches(message)):
         recording_from_mapping(table, tmp_path)
+
+
+def test_one_file_has_one_time_base(tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", q=np.random.default_rng(0).normal(size=(99, 2)), f=np.zeros((50, 2)))
+    columns: dict[str, Any] = {"sample_rate": 1000.0, "joint": "prismatic", "position": "q"}
+    with pytest.raises(ValueError, match=r"'q\[1\]' has 99 samples, but 'f\[1\]' has 50; .*one time base"):
+        load_recording(tmp_path / "t.npz", torque="f", **columns)
+    with pytest.raises(ValueError, match="all columns of a recording come from one file"):
+        load_recording(tmp_path / "t.npz", torque={"file": "other.npz", "column": "f"}, **columns)
+
+
+def test_a_command_is_a_force(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    recording = recording_from_arrays(
+        np.arange(9) / 10, rng.normal(size=9), rng.normal(size=9), command=rng.normal(size=9)
+    )
+    save_recording(recording, tmp_path / "r.csv")
+    columns: dict[str, Any] = {"time": "time_s", "position": "position_rad", "torque": "torque_Nm"}
+    command = {"column": "command_Nm", "unit": "mN m"}
+    read = load_recording(tmp_path / "r.csv", command=command, gear_ratio=2.0, **columns)
+    np.testing.assert_allclose(read.command, 2e-3 * np.asarray(recording.command))
+    with pytest.raises(ValueError, match="command: unit 'deg' does not convert"):
+        load_recording(tmp_path / "r.csv", command=command | {"unit": "deg"}, **columns)
 
 
 # --- real recordings --------------------------------------------------------------------------------------------------
