@@ -14,10 +14,11 @@ import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
 
-from paths import ROOT
+from paths import DATA
 
 jax.config.update("jax_enable_x64", True)
 install_import_hook("jaximp", "shapes.checked")
+pytest.register_assert_rewrite("factories")
 
 STORE = pytest.StashKey[Path]()
 MUCH_MEMORY = 1_500_000_000
@@ -57,10 +58,9 @@ def little_memory() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """Real recordings, which are not part of this project."""
-    folder = Path(os.environ.get("JAXIMP_DATA") or ROOT / "../shared/data")
-    if not folder.is_dir():
+    if not DATA.is_dir():
         pytest.skip("no real recordings here: set JAXIMP_DATA to the folder that holds emps, ankle, double_pendulum")
-    return folder
+    return DATA
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,13 @@ from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
-from paths import ROOT
+from paths import DATA, ROOT
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 600_000
 """Of a notebook with its figures [bytes]."""
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-DATA = Path(os.environ.get("JAXIMP_DATA") or ROOT / "../shared/data").resolve()
-"""Real recordings; a notebook that looks for them runs without them as well."""
+# A notebook that looks for real recordings runs without them as well.
 RUNS = [pytest.param(path, DATA, id=path.stem) for path in NOTEBOOKS] + [
     pytest.param(path, DATA / "nowhere", id=f"{path.stem}, without recordings")
     for path in NOTEBOOKS
