@@ -13,16 +13,18 @@ def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
     Writes the draws as NetCDF for ArviZ, summary.json, report.html and the figures into the folder.
     """
     from jaximp.jobs.job import read_job
-    from jaximp.jobs.run import infer, infer_trials
+    from jaximp.jobs.run import infer
+    from jaximp.jobs.run_trials import ArmInference
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.posterior import write_arm_posterior, write_posterior_results
 
     job = read_job(job_file)
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder, bar_of("sampling") as progress:
-        if job.trials is None:
-            content = write_posterior_results(folder, infer(job, lambda share: progress(0.9 * share)), job)
+        found = infer(job, lambda share: progress(0.9 * share))
+        if isinstance(found, ArmInference):
+            content = write_arm_posterior(folder, found, job)
         else:
-            content = write_arm_posterior(folder, *infer_trials(job, lambda share: progress(0.9 * share)), job)
+            content = write_posterior_results(folder, found, job)
     for line in [f"not to be trusted: {content['why']}"] if content["why"] else content["sentences"]:
         typer.echo(line)
     say_where(out)

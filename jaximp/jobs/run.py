@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from jaximp.identification.check import Finding, Proposal, check_recording
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import Prepared, estimate
 from jaximp.identification.identify import prepare as prepare_recording
 from jaximp.jobs.job import Job
-from jaximp.jobs.run_trials import TrialsResult, identify_trials
-from jaximp.posterior.densities import estimate_density
-from jaximp.posterior.draws import Posterior, derive
+from jaximp.jobs.run_trials import ArmInference, TrialsResult, identify_trials, infer_trials
 from jaximp.posterior.inference import Inference, posterior_of
-from jaximp.posterior.samplers import sample_posterior
 from jaximp.types import Progress, Recording
 
 
@@ -50,12 +45,14 @@ def check(
     return check_recording(job.pipeline_for(recording), recording, alone, progress)
 
 
-def infer(job: Job, progress: Progress = lambda share: None) -> Inference:
-    """Posteriors of a job with a recording.
+def infer(job: Job, progress: Progress = lambda share: None) -> Inference | ArmInference:
+    """Posteriors of a job: `Inference` of a recording and its windows, or, of a job with `[trials]`, `ArmInference`.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy: filters inside every window, parameters
-    that the data leave undetermined, an impossible prior, and as `identify`.
+    that the data leave undetermined, an impossible prior, an impedance without standard errors, and as `identify`.
     """
+    if job.trials is not None:
+        return infer_trials(job, progress)
     return infer_recording(job, job.load(), job.load_robot_alone(), progress)
 
 
@@ -64,21 +61,3 @@ def infer_recording(
 ) -> Inference:
     """As `infer`, for recordings that are in memory."""
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)
-
-
-def infer_trials(job: Job, progress: Progress = lambda share: None) -> tuple[TrialsResult, Posterior]:
-    """An arm's damping and stiffness from a job with `[trials]`: what was identified, and draws around its main
-    estimate.
-
-    Student's t with the estimate's covariance and degrees of freedom, within positive definite stiffnesses.
-
-    **Raises:** `ValueError` for an estimate without standard errors, and as `identify_trials`.
-    """
-    result = identify_trials(job, lambda share: progress(0.8 * share))
-    found = result.main
-    if not np.isfinite(found.covariance).all():
-        raise ValueError(f"the impedance has no standard errors, and so no posterior: {found.reason}")
-    density = estimate_density(found.names, found.units, found.theta, found.covariance, found.dof)
-    drawn = sample_posterior(density, ess=job.posterior.ess, seed=job.posterior.seed)
-    progress(1.0)
-    return result, derive(drawn, density.elements, density.element_names, density.element_units)

@@ -17,6 +17,11 @@ from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.static import StaticFit, static_inertia
 from jaximp.perturbation.trials import Trials
 from jaximp.perturbation.window_lengths import OtherWindows, at_other_windows
+from jaximp.posterior.densities import estimate_density
+from jaximp.posterior.draws import Posterior, credible_interval, derive
+from jaximp.posterior.samplers import sample_posterior
+from jaximp.results import Column, Result
+from jaximp.trust.verdicts import TRUSTED, UNCONVERGED
 from jaximp.types import Numbers, Progress, nearest
 
 
@@ -50,6 +55,69 @@ class TrialsResult:
 
     def __iter__(self) -> Iterator[ArmImpedance]:
         return iter(self.estimates)
+
+
+@dataclass(frozen=True)
+class ArmInference(Result):
+    """An arm's impedance in draws around its main estimate."""
+
+    identified: TrialsResult
+    """What the draws stand around."""
+    posterior: Posterior
+    """Of damping, stiffness and all that follows from them."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.posterior.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.posterior.units
+
+    @property
+    def value(self) -> Numbers:
+        """(p,) means of the draws."""
+        return self.posterior.mean
+
+    @property
+    def stderr(self) -> Numbers:
+        """(p,) standard deviations of the draws."""
+        return np.sqrt(np.diagonal(self.posterior.covariance))
+
+    @property
+    def covariance(self) -> Numbers:
+        """(p, p) of the draws."""
+        return self.posterior.covariance
+
+    @property
+    def dof(self) -> float:
+        """Intervals are quantiles of the draws: no distribution is assumed."""
+        return np.inf
+
+    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
+        """(p,) lower and upper ends of credible intervals, with equal probability on both sides."""
+        return credible_interval(self.posterior.samples, level)
+
+    @property
+    def why(self) -> str:
+        """Why the draws, or the estimate that they stand around, cannot be trusted; empty where they can."""
+        found = self.identified.main
+        return self.posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the draws, see `why`."""
+        return not self.why
+
+    def columns(self) -> list[Column]:
+        """One row: mean and standard deviation of the draws, verdict and reason."""
+        columns = [
+            Column(f"{name}{tail}", unit, number)
+            for name, unit, *numbers in zip(self.names, self.units, self.value, self.stderr, strict=True)
+            for tail, number in zip(("", "_stderr"), numbers, strict=True)
+        ]
+        verdict = self.identified.main.verdict if not self.posterior.why else UNCONVERGED
+        return [*columns, Column("verdict", "", verdict), Column("reason", "", self.why)]
 
 
 def identify_trials(job: Job, progress: Progress = lambda share: None) -> TrialsResult:
@@ -88,6 +156,23 @@ def identify_trials(job: Job, progress: Progress = lambda share: None) -> Trials
     progress(1.0)
     said = tuple(note for note in dict.fromkeys((*notes, *known.notes)) if note not in main.warnings)
     return TrialsResult(tuple(estimates), windows, spectra, known.static(False), known.postures, said)
+
+
+def infer_trials(job: Job, progress: Progress = lambda share: None) -> ArmInference:
+    """An arm's damping and stiffness from a job with `[trials]`.
+
+    Student's t with the estimate's covariance and degrees of freedom, within positive definite stiffnesses.
+
+    **Raises:** `ValueError` for an estimate without standard errors, and as `identify_trials`.
+    """
+    result = identify_trials(job, lambda share: progress(0.8 * share))
+    found = result.main
+    if not np.isfinite(found.covariance).all():
+        raise ValueError(f"the impedance has no standard errors, and so no posterior: {found.reason}")
+    density = estimate_density(found.names, found.units, found.theta, found.covariance, found.dof)
+    drawn = sample_posterior(density, ess=job.posterior.ess, seed=job.posterior.seed)
+    progress(1.0)
+    return ArmInference(result, derive(drawn, density.elements, density.element_names, density.element_units))
 
 
 def check_trials(job: Job) -> None:

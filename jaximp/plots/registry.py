@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaximp.design.excitation import Design
 from jaximp.identification.estimates import Estimates
-from jaximp.jobs.run_trials import TrialsResult
+from jaximp.jobs.run_trials import ArmInference, TrialsResult
 from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.plots.arm import ellipses
 from jaximp.plots.estimates import parameters_over_time
@@ -56,6 +56,11 @@ def _(result: Inference) -> Figure:
     if windows is None or not result.good.any():
         return corner(whole)
     return bands(result.end, windows, trusted=result.good)
+
+
+@figure_of.register
+def _(result: ArmInference) -> Figure:
+    return corner(result.posterior)
 
 
 @figure_of.register

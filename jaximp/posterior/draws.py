@@ -83,6 +83,17 @@ class Posterior(eqx.Module):
         return np.asarray(self.chains)[..., index_of(self.names, name)]
 
 
+def credible_interval(samples: Float[AnyArray, "draws p"], level: float = 0.95) -> tuple[Numbers, Numbers]:
+    """(p,) lower and upper ends of the intervals that hold `level` of the draws, with as many on either side.
+
+    **Raises:** `ValueError` for a level that does not lie between 0 and 1.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level is {level}: it must lie between 0 and 1")
+    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return low, high
+
+
 class PosteriorMany(eqx.Module):
     """The posteriors of M windows, one for each; `posteriors[k]` is that of window k. A window that failed is NaN."""
 

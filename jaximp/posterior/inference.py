@@ -44,7 +44,15 @@ from jaximp.posterior.densities import (
     undetermined,
     window_densities,
 )
-from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_posterior, probability_greater, stacked
+from jaximp.posterior.draws import (
+    Posterior,
+    PosteriorMany,
+    credible_interval,
+    derive,
+    exact_posterior,
+    probability_greater,
+    stacked,
+)
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.posterior.samplers import sample_many, sample_posterior
@@ -155,10 +163,7 @@ class Inference(Result):
 
     def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
         """(p,) lower and upper ends of credible intervals, with equal probability on both sides."""
-        if not 0 < level < 1:
-            raise ValueError(f"level is {level}: it must lie between 0 and 1")
-        low, high = np.quantile(self.summarised[0].samples, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        return low, high
+        return credible_interval(self.summarised[0].samples, level)
 
     @property
     def trusted(self) -> bool:

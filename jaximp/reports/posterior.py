@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximp import plots
 from jaximp.jobs.job import Job
-from jaximp.jobs.run_trials import TrialsResult
+from jaximp.jobs.run_trials import ArmInference
 from jaximp.least_squares.noise import ATTENUATION
 from jaximp.plots.wording import pretty_unit, words
 from jaximp.posterior.densities import stiffness_matrices
@@ -121,17 +121,17 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     return _write(folder, content, figures, live_figures(found, shown, changes))
 
 
-def write_arm_posterior(folder: str | Path, result: TrialsResult, posterior: Posterior, job: Job) -> dict[str, Any]:
+def write_arm_posterior(folder: str | Path, inference: ArmInference, job: Job) -> dict[str, Any]:
     """The same for an arm's damping and stiffness from perturbed movements."""
-    folder, found = Path(folder), result.main
+    folder, posterior, found = Path(folder), inference.posterior, inference.identified
     save_posterior(folder / "posterior.nc", posterior)
     D, K = stiffness_matrices(posterior.samples)
     ellipses = {"stiffness": {"arm": K}, "damping": {"arm": D}}
     units = {"stiffness": "N m/rad", "damping": "N m s/rad"}
     figures = {"corner": plots.corner(posterior), "ellipses": plots.ellipse_bands(ellipses, units)}
-    why = posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
-    of = f"the impedance of {found.trials} perturbed movements"
-    content = _content(job, posterior, of, list(posterior.names), [*found.warnings, *result.notes], why)
+    of = f"the impedance of {found.main.trials} perturbed movements"
+    remarks = [*found.main.warnings, *found.notes]
+    content = _content(job, posterior, of, list(posterior.names), remarks, inference.why)
     return _write(folder, content | {"changes": []}, figures, {})
 
 

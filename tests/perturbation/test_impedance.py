@@ -17,7 +17,8 @@ import pytest
 
 from command_line import jaximp
 from jaximp.jobs.job import parse_job, read_job
-from jaximp.jobs.run_trials import identify_trials
+from jaximp.jobs.run import infer
+from jaximp.jobs.run_trials import ArmInference, identify_trials
 from jaximp.models import BASE_INERTIA, ArmGeometry, PlanarArm
 from jaximp.perturbation import trial_fits as fit
 from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
@@ -247,6 +248,22 @@ def test_given_inertia_without_errors_is_a_warning(enough: Path) -> None:
     assert any("given without standard errors" in warning for warning in found.main.warnings)
     assert found.main.arm.inertia_stderr is None
     assert found.main.inertia == {"upper_arm_inertia": 0.1945, "forearm_inertia": 0.0737, "coupling_inertia": 0.0838}
+
+
+@pytest.mark.slow
+def test_draws_stand_around_what_was_identified(enough: Path) -> None:
+    found = infer(read_job(enough / "job.toml"))
+    assert isinstance(found, ArmInference)
+    estimate = found.identified.main
+    assert found.trusted == (estimate.verdict == "trusted"), found.why
+    for name in ("damping_11", "stiffness_11", "stiffness_22"):
+        low, high = found[name].interval(0.95)
+        assert low < estimate[name].value < high
+        assert found[name].stderr == pytest.approx(estimate[name].stderr, rel=0.4)
+        assert found[name].unit == estimate[name].unit
+    row = found.to_pandas().iloc[0]
+    assert row["stiffness_11"] == found["stiffness_11"].value
+    assert row["verdict"] == estimate.verdict
 
 
 def lagging(milliseconds: float) -> Callable[[Trials], Trials]:
