@@ -40,7 +40,7 @@ from .posterior.inference import compare_models as compare_models
 from .posterior.samplers import sample_posterior as sample_posterior
 from .recordings.load import load_recording as load_recording
 from .recordings.load import recording_from_arrays as recording_from_arrays
-from .recordings.load import save_recording as save_recording
+from .recordings.save import save_recording as save_recording
 from .trust.limits import TrustLimits as TrustLimits
 from .types import Recording as Recording
 

@@ -2,7 +2,7 @@
 
 The plan follows from the job, the list of recordings and their sizes alone, never from what is done already: that is
 why a batch that was broken off and resumed gives the same bits as one that was not. Sizes are learnt from what a file
-says of itself (`readers.count_samples`); nothing is decoded here.
+says of itself (`formats.count_samples`); nothing is decoded here.
 
 A manifest is data from elsewhere: its paths must stay inside its folder, and only plain files are read.
 """
@@ -25,8 +25,10 @@ import numpy as np
 
 from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job
+from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.outputs import MARK
-from jaximp.recordings.readers import FORMATS, RecordingError, count_samples, delimiter_of
+from jaximp.recordings.readers.formats import FORMATS, count_samples
+from jaximp.recordings.readers.text import delimiter_of
 
 MOST_SIZES = 3
 """Padded lengths of a plan: each is compiled once, and a study should need no more than six programs."""

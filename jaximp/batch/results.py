@@ -35,8 +35,9 @@ from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
+from jaximp.recordings.errors import RecordingError, UnavailableError
 from jaximp.recordings.load import recording_from_mapping
-from jaximp.recordings.readers import MATRICES, RecordingError, UnavailableError, count_samples
+from jaximp.recordings.readers.formats import MATRICES, count_samples
 from jaximp.reports.estimates import estimates_table
 from jaximp.reports.pages import table_of, versions
 from jaximp.trust.verdicts import VERDICTS

@@ -34,8 +34,9 @@ from jaximp.jobs.settings import check_keys, settings
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.reading import TASKS, read_trials
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
-from jaximp.recordings.load import check_mapping, load_recording, load_trial_table
-from jaximp.recordings.readers import FORMATS
+from jaximp.recordings.load import load_recording, load_trial_table
+from jaximp.recordings.mapping import check_mapping
+from jaximp.recordings.readers.formats import FORMATS
 from jaximp.types import Recording, nearest
 
 STATIC_WINDOW = 0.4

@@ -19,7 +19,8 @@ from jaximp.models.inertia import BASE_INERTIA
 from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.stiffness import symmetric_matrix
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Trials
-from jaximp.recordings.load import recording_from_arrays, save_trial_table
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.recordings.save import save_trial_table
 from jaximp.simulation.neuromuscular import (
     ANGLES,
     POSTURES,

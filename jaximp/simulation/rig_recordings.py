@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 
 from jaximp.motion.trajectories import FourierSeries
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.save import save_recording
 from jaximp.simulation.rig import (
     HUMAN_TRAJECTORY,
     ElasticBands,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from factories.studies import JOB, LENGTHS, joint, run
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.save import save_recording
 
 
 @pytest.fixture(scope="session")

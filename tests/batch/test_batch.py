@@ -19,7 +19,8 @@ from jaximp.batch.plan import find_items, make_plan
 from jaximp.jobs.job import parse_job, read_job
 from jaximp.jobs.run import identify_recording
 from jaximp.least_squares import sliding as windows
-from jaximp.recordings.load import recording_from_arrays, save_recording
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.recordings.save import save_recording
 
 
 def test_the_data_set_holds_what_identify_finds(study: Path) -> None:

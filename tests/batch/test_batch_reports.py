@@ -11,7 +11,8 @@ from factories.studies import JOB, joint
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
 from jaximp.jobs.job import Job, parse_job
-from jaximp.recordings.load import recording_from_arrays, save_recording
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.recordings.save import save_recording
 from jaximp.types import Recording
 
 

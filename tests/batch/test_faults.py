@@ -24,8 +24,8 @@ from jaximp.batch import run as batch
 from jaximp.batch.plan import find_items
 from jaximp.identification.identify import Prepared
 from jaximp.jobs.job import parse_job
-from jaximp.recordings import readers
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.readers import formats
+from jaximp.recordings.save import save_recording
 
 
 class Fault:
@@ -127,20 +127,20 @@ def no_memory_to_read(fault: Fault, out: Path) -> None:
     def fail(path: Path, names: list[str]) -> object:
         raise pa.ArrowMemoryError("malloc of size 8000 failed")
 
-    fault.patch.setitem(readers._READERS, ".parquet", fail)
+    fault.patch.setitem(formats.FORMATS, ".parquet", replace(formats.FORMATS[".parquet"], read=fail))
     assert run(fault.study, out).exit_status == 1
 
 
 def too_many_files(fault: Fault, out: Path) -> None:
     """Files cannot be opened for a while."""
-    original = readers._READERS[".parquet"]
+    original = formats.FORMATS[".parquet"].read
 
     def fail(path: Path, names: list[str]) -> object:
         if path.name == "r3.parquet":
             raise OSError(errno.EMFILE, "Too many open files")
         return original(path, names)
 
-    fault.patch.setitem(readers._READERS, ".parquet", fail)
+    fault.patch.setitem(formats.FORMATS, ".parquet", replace(formats.FORMATS[".parquet"], read=fail))
     outcome = run(fault.study, out)
     assert outcome.exit_status == 3
     assert "Too many open files" in outcome.failed[0]["reason"]

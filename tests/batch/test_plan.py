@@ -13,8 +13,8 @@ from jaximp.batch import plan as batch_plan
 from jaximp.batch import run as batch
 from jaximp.batch.plan import find_items, make_plan, padded_sizes
 from jaximp.jobs.job import parse_job
-from jaximp.recordings import readers
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.readers import formats
+from jaximp.recordings.save import save_recording
 
 
 @pytest.mark.parametrize("most", [1, 2, 5])
@@ -56,7 +56,7 @@ def test_a_manifest_cannot_leave_its_folder(tmp_path: Path, path: str) -> None:
 def test_the_variable_of_the_sample_rate_is_counted_too(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "r.npz", q=np.zeros(10), tau=np.zeros(10), fs=np.zeros(20_000))
     table = {"position": "q", "torque": "tau", "sample_rate": "fs"}
-    assert readers.count_samples(tmp_path / "r.npz", batch_plan.channel_columns(table)) == 20_000
+    assert formats.count_samples(tmp_path / "r.npz", batch_plan.channel_columns(table)) == 20_000
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
 from jaximp.numerics import compilation
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.save import save_recording
 from jaximp.types import Recording
 
 

@@ -14,7 +14,7 @@ import jaximp
 from factories.joints import TIME, joint
 from jaximp import papers
 from jaximp.cli.reproduce import Paper
-from jaximp.recordings.load import save_recording
+from jaximp.recordings.save import save_recording
 
 JOB = """
 [recording]

@@ -20,7 +20,8 @@ from jaximp.perturbation.onsets import find_onset
 from jaximp.perturbation.reading import read_trials
 from jaximp.perturbation.sensors import judge_sensors
 from jaximp.perturbation.trials import VOLUNTARY_DELAY, Handle, Trials
-from jaximp.recordings.load import load_trial_table, save_recording, save_trial_table
+from jaximp.recordings.load import load_trial_table
+from jaximp.recordings.save import save_recording, save_trial_table
 from jaximp.signals import savitzky_golay, savitzky_golay_gain
 from jaximp.simulation.arm_recordings import Sensors, arm_movements, as_recordings
 from jaximp.simulation.neuromuscular import ANGLES, POSTURES, NeuromuscularArm, Reaches, hold_posture

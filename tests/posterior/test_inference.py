@@ -23,7 +23,8 @@ from jaximp.posterior.draws import Posterior, make_posterior, stacked
 from jaximp.posterior.files import load_posterior
 from jaximp.posterior.inference import Inference, compare_models, sentences
 from jaximp.posterior.predictive import PriorPredictive
-from jaximp.recordings.load import recording_from_arrays, save_recording
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.recordings.save import save_recording
 from jaximp.reports import posterior as posterior_report
 from jaximp.types import Recording
 

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from factories.recordings import MAPPING, assert_equal, matches, signals, write_csv
 from factories.studies import joint
-from jaximp.recordings import readers
+from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.load import load_recording, recording_from_arrays
+from jaximp.recordings.readers import formats, mat
 
 
 def nested_mat(path: Path, columns: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -194,16 +195,16 @@ def test_a_struct_is_counted_by_what_it_unpacks_to(tmp_path: Path) -> None:
     one = joint(1000)
     data = {"t": one.time, "q": one.position, "tau": one.torque}
     savemat(tmp_path / "s.mat", {"data": data, "other": np.zeros((3, 2000))}, do_compression=True)
-    assert readers.count_samples(tmp_path / "s.mat", ["data.t", "data.q", "data.tau"]) == 1000
+    assert formats.count_samples(tmp_path / "s.mat", ["data.t", "data.q", "data.tau"]) == 1000
 
 
 def test_a_struct_that_unpacks_to_too_much_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from scipy.io import savemat
 
     savemat(tmp_path / "s.mat", {"data": {"t": np.zeros(200_000)}}, do_compression=True)
-    monkeypatch.setattr(readers, "MOST_NUMBERS", 100_000)
-    monkeypatch.setattr(readers, "_read_mat", lambda *args: pytest.fail("it was read") if args[1] else {})
-    assert readers.count_samples(tmp_path / "s.mat", ["data.t"]) > 100_000
+    monkeypatch.setattr(mat, "MOST_NUMBERS", 100_000)
+    monkeypatch.setattr(mat, "read", lambda *args: pytest.fail("it was read") if args[1] else {})
+    assert formats.count_samples(tmp_path / "s.mat", ["data.t"]) > 100_000
 
 
 def square(folder: Path) -> None:
@@ -242,8 +243,8 @@ def virtual(folder: Path) -> None:
 def test_an_hdf5_file_holds_its_own_numbers_and_no_more(tmp_path: Path, make: Callable[[Path], None]) -> None:
     make(tmp_path)
     why = "has shape" if make is square else "lies in another file"
-    with pytest.raises(readers.RecordingError, match=why):
-        readers.count_samples(tmp_path / "a.h5", ["torque_Nm"])
+    with pytest.raises(RecordingError, match=why):
+        formats.count_samples(tmp_path / "a.h5", ["torque_Nm"])
     if make is not square:
-        with pytest.raises(readers.RecordingError, match=why):
-            readers.read_columns(tmp_path / "a.h5", ["torque_Nm"])
+        with pytest.raises(RecordingError, match=why):
+            formats.read_columns(tmp_path / "a.h5", ["torque_Nm"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
@@ -16,7 +17,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from factories.recordings import CHANNELS, MAPPING, assert_equal, matches, signals, write_csv
-from jaximp.recordings.load import load_recording, recording_from_arrays, recording_from_mapping, save_recording
+from jaximp.recordings.load import load_recording, recording_from_arrays, recording_from_mapping
+from jaximp.recordings.mapping import KEYS
+from jaximp.recordings.save import save_recording
 from jaximp.types import Recording
 
 # --- units ------------------------------------------------------------------------------------------------------------
@@ -278,6 +281,10 @@ def test_mapping_of_a_job_file(tmp_path: Path) -> None:
     recording = recording_from_mapping({"file": "run.csv", **MAPPING}, tmp_path)
     assert_equal(recording, recording_from_arrays(columns["t"], columns["q"], columns["tau"]))
     assert recording.name == "run"
+
+
+def test_the_keys_of_a_mapping_are_the_keywords_of_load_recording() -> None:
+    assert tuple(inspect.signature(load_recording).parameters) == ("path", *KEYS)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,96 @@
+"""Channels become a `Recording`: checks of every channel, and one uniform grid for all of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.recordings.channels import Signal, check_lengths
+from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.grid import check_stamps, on_uniform_grid
+from jaximp.types import Recording
+
+
+def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...], name: str) -> Recording:
+    """Check every channel and bring all of them onto one uniform grid."""
+    _check_shapes(clock, signals, len(joints))
+    stamps = clock.values[:, 0]
+    check_stamps(clock.labels[0], stamps)
+    labels = [label for signal in signals.values() for label in signal.labels]
+    samples = np.hstack([signal.values for signal in signals.values()])
+    valid, notes = _complete_rows(labels, samples)
+    for channel in ("position", "torque"):
+        notes += _check_motion(channel, signals[channel], valid)
+    time, samples, valid, sampling_notes = on_uniform_grid(stamps, samples, valid)
+    _check_enough(valid)
+    samples[~valid] = np.nan
+    borders = np.cumsum([len(signal.labels) for signal in signals.values()])[:-1]
+    channels = dict(zip(signals, np.split(samples, borders, axis=1), strict=True))
+    arrays = {key: _frozen(array) for key, array in (channels | {"time": time, "valid": valid}).items()}
+    return Recording(**arrays, joints=joints, name=name, notes=(*sampling_notes, *notes))
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array = np.array(array, order="C")
+    array.setflags(write=False)
+    return array
+
+
+def _check_shapes(clock: Signal, signals: dict[str, Signal], n: int) -> None:
+    if len(clock.labels) != 1:
+        raise RecordingError(
+            f"time has {len(clock.labels)} columns; name a single one (channels with times of their own: resample them)"
+        )
+    for channel, signal in signals.items():
+        if len(signal.labels) != n and channel != "force":
+            raise RecordingError(f"{channel} has {len(signal.labels)} columns for {n} joints; give one per joint")
+    # A clock that was made of a rate is as long as the position, which is then to be named.
+    compared = [*signals.values(), clock] if clock.labels == ("sample_rate",) else [clock, *signals.values()]
+    check_lengths([(signal.labels[0], signal.values) for signal in compared])
+    if len(clock.values) < 3:
+        raise RecordingError(
+            f"has {len(clock.values)} samples; at least 3 are needed, and a useful fit needs many more"
+        )
+
+
+def _complete_rows(labels: list[str], samples: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[str]]:
+    """(N,) True where every channel was measured, and a note if that is not everywhere."""
+    if np.isfinite(samples).all():
+        return np.ones(len(samples), bool), []
+    infinite = np.argwhere(np.isinf(samples))
+    if len(infinite):
+        row, i = infinite[0]
+        raise RecordingError(f"column {labels[i]!r}, row {row + 1}: the value is infinite; repair or remove the row")
+    missing = np.isnan(samples)
+    for label, column in zip(labels, missing.T, strict=True):
+        if column.all():
+            raise RecordingError(f"column {label!r} is NaN throughout: nothing was measured; name another column")
+    valid = np.asarray(~missing.any(axis=1))
+    _check_enough(valid)
+    if valid.all():
+        return valid, []
+    counts = [f"{label!r} ({column.sum()})" for label, column in zip(labels, missing.T, strict=True) if column.any()]
+    return valid, [f"{(~valid).sum()} of {len(valid)} samples are masked because of NaN in {', '.join(counts)}"]
+
+
+def _check_enough(valid: NDArray[np.bool_]) -> None:
+    if valid.sum() < 3:
+        raise RecordingError(
+            f"only {valid.sum()} of {len(valid)} samples are usable (no NaN, no gap); record at least 3"
+        )
+
+
+def _check_motion(channel: str, signal: Signal, valid: NDArray[np.bool_]) -> list[str]:
+    """Nothing can be identified from a constant signal; one resting joint of several is worth a note."""
+    remark = {"position": "the joint did not move", "torque": "nothing was measured"}[channel]
+    measured = signal.values[valid]
+    constant = (measured == measured[0]).all(axis=0)
+    notes = [
+        f"column {label!r} is constant ({value:.6g}): {remark}"
+        for label, value in zip(np.array(signal.labels)[constant].tolist(), measured[0, constant], strict=True)
+    ]
+    if constant.all():
+        raise RecordingError("; ".join(notes) + "; name another column or another recording")
+    return notes

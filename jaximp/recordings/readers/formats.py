@@ -1,0 +1,73 @@
+"""Which kinds of files can be read, and by what: the table of the readers, and the only way to them.
+
+A new kind of file is one module beside this one and one row of `FORMATS`. Libraries that take long to import are
+imported in the function that needs them. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaximp.recordings.errors import RecordingError, UnavailableError
+from jaximp.recordings.readers import hdf5, mat, npz, parquet, text
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file, and how it is read."""
+
+    read: Callable[[Path, list[str]], dict[str, Any]]
+    """The named columns of a file. What its library raises, `read_columns` puts into words."""
+    count: Callable[[Path, list[str]], int]
+    """How many samples a file says that it holds of some columns, without reading them; zero where it does not say."""
+    matrices: bool = False
+    """Whether one variable may hold several columns, one per joint."""
+
+
+FORMATS = {
+    **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count)),
+    ".parquet": Format(parquet.read, parquet.count),
+    ".mat": Format(mat.read, mat.count, matrices=True),
+    **dict.fromkeys((".h5", ".hdf5"), Format(hdf5.read, hdf5.count, matrices=True)),
+    ".npz": Format(npz.read, npz.count, matrices=True),
+}
+"""By the extension of the file, in small letters."""
+MATRICES = tuple(extension for extension, kind in FORMATS.items() if kind.matrices)
+"""Extensions of files in which one variable may hold several columns."""
+
+
+def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
+    """The named columns of a file; whatever a reader's library raises becomes one line."""
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise RecordingError(f"cannot read '{path.suffix}' files; use one of: {', '.join(FORMATS)}")
+    try:
+        return kind.read(path, list(dict.fromkeys(names)))
+    except (RecordingError, MemoryError):
+        raise
+    except UnicodeDecodeError:
+        raise RecordingError("is not UTF-8 text; save it with that encoding") from None
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise UnavailableError(f"cannot be read ({os.strerror(error.errno)}); solve that and try again") from None
+        cause = " ".join(str(error).split())[:100] or type(error).__name__
+        remedy = "the file is damaged, cut short or of another kind; write it anew"
+        raise RecordingError(f"cannot be read as {path.suffix} ({cause}): {remedy}") from None
+
+
+def count_samples(path: Path, names: list[str]) -> int:
+    """How many samples a file says that it holds of some columns, without reading them: zero where it does not say.
+
+    **Raises:** `RecordingError` for a variable that must not be read. What else is wrong, `read_columns` says.
+    """
+    kind = FORMATS.get(path.suffix.lower())
+    try:
+        return 0 if kind is None else kind.count(path, names)
+    except (RecordingError, MemoryError):
+        raise
+    except Exception:
+        return 0
