@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.columns import largest, require
@@ -27,8 +28,6 @@ def read(path: Path, names: list[str]) -> dict[str, Any]:
 def count(path: Path, names: list[str]) -> int:
     """Read from the headers of the arrays inside; the numbers stay compressed."""
     import zipfile
-
-    from numpy.lib import format as npy
 
     shapes = {}
     with zipfile.ZipFile(path) as archive:
