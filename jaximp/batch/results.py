@@ -354,9 +354,10 @@ def _solve_stacks(task: Task, results: Sequence[Result]) -> None:
 
 def _kind_of(found: Measured) -> tuple[Any, ...]:
     """What recordings must have in common to be solved by one program."""
-    pipeline, noise = found.pipeline, found.pipeline.filters.noise
-    lags = 0 if noise is None else -(-len(noise) // LAGS_GRAIN)
-    return found.model, pipeline.filters.decimate, pipeline.window_rows, pipeline.step_rows, lags
+    pipeline, filters = found.pipeline, found.pipeline.filters
+    lags = 0 if filters.noise is None else -(-len(filters.noise) // LAGS_GRAIN)
+    half = filters.differentiator.half
+    return found.model, filters.decimate, half, pipeline.window_rows, pipeline.step_rows, lags
 
 
 def _prepared(several: Sequence[Measured], padded: int, stacked: int) -> list[Prepared | ValueError]:

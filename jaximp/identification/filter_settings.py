@@ -12,6 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import signals
+from jaximp.types import nearest
+
+KINDS = ["wideband", "central"]
+"""Of derivatives."""
+OPEN_BAND = 0.8
+"""Where no filter limits the position: up to where derivatives are right, as a share of half the sample rate."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,10 @@ class FilterSettings:
     drop_transient: bool = True
     """With `mode = "window"`: leave out the rows at both ends of the window that its edges disturb. Kept, they biased
     the inertia by 2.2 standard deviations on the simulated rig; left out, by 0.1 (experiments/coverage.py)."""
+    derivatives: str = "wideband"
+    """`wideband` differentiates the position with an error below 0.1 % up to its cut-off, at any sample rate (without a
+    cut-off up to 0.8 of half the rate); `central` takes the paper's central differences, which are 2 % off at a ninth
+    of half the sample rate."""
     measured_derivatives: bool = False
     """Use the recording's velocity (and acceleration, where it has one) in place of differences of the position."""
 
@@ -53,6 +63,13 @@ class Filters:
     """Second-order sections that the torque and every column pass."""
     decimate: int
     """Every n-th sample is kept."""
+    band: float | None = None
+    """Share of half the sample rate up to which derivatives are right; None stands for central differences."""
+
+    @property
+    def differentiator(self) -> signals.Differentiator:
+        """What makes velocity and acceleration of the position."""
+        return signals.CENTRAL if self.band is None else signals.design_differentiator(self.band)
 
     @property
     def reach(self) -> int:
@@ -77,7 +94,8 @@ class Filters:
 
 @lru_cache(maxsize=64)
 def _reach_of(filters: Filters, share: float) -> int:
-    return sum(signals.reach(sos, share) for sos in (filters.position, filters.parallel) if sos is not None)
+    reach = sum(signals.reach(sos, share) for sos in (filters.position, filters.parallel) if sos is not None)
+    return reach if filters.band is None else reach + filters.differentiator.half
 
 
 @lru_cache(maxsize=64)
@@ -104,7 +122,21 @@ def design_filters(settings: FilterSettings, sample_rate: float) -> Filters:
     position = None
     if settings.position_cutoff is not None:
         position = signals.butterworth(settings.position_order, settings.position_cutoff, sample_rate)
-    return Filters(_plain(position), _plain(np.concatenate(parallel)) if parallel else None, decimate)
+    return Filters(
+        _plain(position),
+        _plain(np.concatenate(parallel)) if parallel else None,
+        decimate,
+        _band(settings, sample_rate),
+    )
+
+
+def _band(settings: FilterSettings, sample_rate: float) -> float | None:
+    """Up to where derivatives must be right, as a share of half the sample rate."""
+    if settings.derivatives == "central":
+        return None
+    if settings.derivatives != "wideband":
+        raise ValueError(f"filter.derivatives is '{settings.derivatives}': {nearest(settings.derivatives, KINDS)}")
+    return OPEN_BAND if settings.position_cutoff is None else 2 * settings.position_cutoff / sample_rate
 
 
 def _plain(sos: NDArray[np.float64] | None) -> signals.Sections | None:

@@ -67,7 +67,7 @@ def _rows_of_windows(
     """Regressor (M, rows, *n, p), torque and speed (M, rows, *n) of all windows."""
     if filters.position is not None:
         q = signals.filter_in_windows(filters.position, q)
-    dq, ddq = signals.differences_in_windows(q, sample_rate)
+    dq, ddq = signals.differentiate_in_windows(q, sample_rate, filters.differentiator)
     speed = np.abs(dq.at(np.arange(0, q.shapes.shape[1], filters.decimate)))
     one = signals.cut_signal(np.ones_like(q.whole), q.starts, q.shapes.shape[1])
     motion = dict(zip(MOTION, (q, dq, ddq, one), strict=True)) if model.n_joints == 1 else {}
@@ -129,7 +129,7 @@ def _other_columns(
     def put(first: int) -> None:
         part = slice(first, first + per_part)
         samples = whole[first * step :][: (per_part - 1) * step + window]
-        sizes = (sample_rate, filters.decimate, step, at_a_time)
+        sizes = (sample_rate, filters.decimate, step, at_a_time, filters.differentiator)
         found[part] = _columns(model, chosen, *sizes, samples, shapes, amounts[part], response)[: n_windows - first]
 
     with ThreadPoolExecutor(cores()) as pool:
@@ -149,6 +149,7 @@ def _columns(
     decimate: int,
     step: int,
     at_a_time: int,
+    differentiator: signals.Differentiator,
     whole: AnyArray,
     shapes: Array,
     amounts: AnyArray,
@@ -159,7 +160,7 @@ def _columns(
     def one(start: Array, amount: Array) -> Array:
         (samples,) = slice_window((whole,), start, shapes.shape[1])
         q = samples + (amount @ shapes).T
-        W = model.observation_matrix(q, *signals.central_differences(q, sample_rate))
+        W = model.observation_matrix(q, *signals.differentiate(q, sample_rate, differentiator))
         if response is None:
             return W[::decimate, ..., jnp.array(chosen)]
         # Column by column, as they come out of the model: side by side they would first be copied.

@@ -136,6 +136,7 @@ class _Stack(eqx.Module):
     sample_rate: AnyArray
     position: signals.PaddedFilter | None
     parallel: signals.PaddedFilter | None
+    differentiator: signals.Differentiator
 
 
 def regress_stack(several: Sequence[Measured], padded: int, stacked: int) -> Filtered:
@@ -195,6 +196,7 @@ def _stacked(several: Sequence[Measured], padded: int) -> _Stack:
         sample_rate=np.array([one.recording.sample_rate for one in several]),
         position=filters("position"),
         parallel=filters("parallel"),
+        differentiator=jax.tree.map(lambda *x: np.stack(x), *(one.pipeline.filters.differentiator for one in several)),
     )
 
 
@@ -212,7 +214,9 @@ def _program(decimate: int, model: Model, stack: _Stack) -> Filtered:
         def passing(filters: signals.PaddedFilter | None) -> Callable[[AnyArray], Array]:
             return jnp.asarray if filters is None else partial(_filter_columns, filters, one.samples)
 
-        differences = partial(signals.central_differences_padded, sample_rate=one.sample_rate, n=one.samples)
+        differences = partial(
+            signals.differentiate_padded, sample_rate=one.sample_rate, n=one.samples, by=one.differentiator
+        )
         return _columns_of(model, (passing(one.position), passing(one.parallel)), differences, decimate, motion)
 
     def solve(one: _Stack) -> Filtered:
@@ -234,9 +238,9 @@ def filtered(
     def passing(sos: signals.Sections | None) -> Callable[[AnyArray], Array]:
         return jnp.asarray if sos is None else partial(signals.filter_zero_phase, sos)
 
-    passes, differences = (passing(filters.position), passing(filters.parallel)), signals.central_differences
-    motion = (q, torque, None, None)
-    return _columns_of(model, passes, partial(differences, sample_rate=sample_rate), filters.decimate, motion)
+    passes = passing(filters.position), passing(filters.parallel)
+    differences = partial(signals.differentiate, sample_rate=sample_rate, by=filters.differentiator)
+    return _columns_of(model, passes, differences, filters.decimate, (q, torque, None, None))
 
 
 def _filter_columns(filters: signals.PaddedFilter, n: Array, x: AnyArray) -> Array:

@@ -42,7 +42,7 @@ BEFORE, AFTER = 0.15, 0.57
 """Time that is kept before and after the onset [s]."""
 REPEATS = 5
 HELD_OUT = 29
-FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0)
+FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0, derivatives="central")
 """The paper says only that its low-pass is without phase."""
 FORCE_NOISE = np.array([0.02, 0.1, 0.5])  # N
 POSITION_NOISE = np.array([2e-6, 1e-5, 5e-5])  # m, with the noise of the force at the same place

@@ -127,7 +127,12 @@ def _pipeline(offset: bool, length: float, methods: tuple[int, ...] = (1,), mode
         methods=methods,
         window=WindowSettings(length, step=0.02, min_velocity=0.1),
         filter=FilterSettings(
-            position_cutoff=10.0, decimation_cutoff=5.0, mode=mode, drop_transient=False, decimate=40
+            position_cutoff=10.0,
+            decimation_cutoff=5.0,
+            mode=mode,
+            drop_transient=False,
+            decimate=40,
+            derivatives="central",
         ),
         reference=10.0,
     )

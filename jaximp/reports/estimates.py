@@ -48,6 +48,10 @@ if TYPE_CHECKING:
 
     from jaximp.plots.interactive import Live
 
+DERIVATIVES = {
+    "wideband": "of the position, right to 0.1 % up to its cut-off",
+    "central": "central differences of the position",
+}
 REMEDIES = {
     TRUSTED: "",
     WEAK: "Excite the joint more, with larger and faster motion of several frequencies, or lengthen window.length.",
@@ -486,7 +490,7 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "high-pass of torque and regressor": cutoff("high_pass", "high_pass_order"),
         "samples kept after the filters": "all" if filters["decimate"] == 1 else f"one of {filters['decimate']}",
         "filters run": "once, over the whole recording" if filters["mode"] == "once" else "inside every window",
-        "derivatives": "measured" if filters["measured_derivatives"] else "central differences of the position",
+        "derivatives": "measured" if filters["measured_derivatives"] else DERIVATIVES[filters["derivatives"]],
         "window": f"{content['window_s']:g} s" + ("" if step is None else f", one every {step:.3g} s"),
         "slowest motion that counts": f"{content['min_velocity']:g} {speed}" if content["min_velocity"] else "any",
         "threshold on the condition number": "none" if threshold is None else f"{threshold:.4g}",

@@ -1,6 +1,10 @@
+from .derivatives import CENTRAL as CENTRAL
+from .derivatives import Differentiator as Differentiator
 from .derivatives import central_differences as central_differences
-from .derivatives import central_differences_padded as central_differences_padded
-from .derivatives import differences_in_windows as differences_in_windows
+from .derivatives import design_differentiator as design_differentiator
+from .derivatives import differentiate as differentiate
+from .derivatives import differentiate_in_windows as differentiate_in_windows
+from .derivatives import differentiate_padded as differentiate_padded
 from .derivatives import savitzky_golay as savitzky_golay
 from .derivatives import savitzky_golay_gain as savitzky_golay_gain
 from .derivatives import savitzky_golay_half_length as savitzky_golay_half_length

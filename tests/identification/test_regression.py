@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
-from jaximp.signals import central_differences
+from jaximp.signals import differentiate
 from jaximp.types import Recording
 
 RATE = 1000.0
@@ -27,13 +29,13 @@ def recording(n_joints: int) -> Recording:
     return recording_from_arrays(time, q, torque)
 
 
-def job(step: float, **filters: float | int | None) -> Job:
-    settings = {"position_cutoff": 60.0, "position_order": 8, "decimation_cutoff": 20.0} | filters
+def job(step: float, **filters: float | int | str | None) -> Job:
+    settings: dict[str, Any] = {"position_cutoff": 60.0, "position_order": 8, "decimation_cutoff": 20.0} | filters
     return Job(
         recording={},
         model=ModelSettings(HumanSettings(offset="high_pass" not in filters), RobotSettings()),
         window=WindowSettings(0.3, step, min_velocity=0.5),
-        filter=FilterSettings(**settings, mode="window", drop_transient=False),  # type: ignore[arg-type]
+        filter=FilterSettings(**settings, mode="window", drop_transient=False),
     )
 
 
@@ -44,7 +46,7 @@ def rows_of(
     q, torque = (x[:, 0] if x.shape[1] == 1 else x for x in (q, torque))
     if filters.position is not None:
         q = sosfiltfilt(np.array(filters.position), q, axis=0)
-    dq, ddq = (np.asarray(x) for x in central_differences(q, RATE))
+    dq, ddq = (np.asarray(x) for x in differentiate(q, RATE, filters.differentiator))
     both = np.concatenate([np.asarray(model.observation_matrix(q, dq, ddq)), torque[..., None]], axis=-1)
     if filters.parallel is not None:
         both = sosfiltfilt(np.array(filters.parallel), both, axis=0)
@@ -60,10 +62,13 @@ def rows_of(
         (1, 0.04, {"high_pass": 2.0, "decimate": 1}),
         (2, 0.05, {}),
         (1, 0.7, {}),
+        (1, 0.04, {"derivatives": "central"}),
     ],
-    ids=["many windows", "position as it is", "no parallel filter", "all rows", "two joints", "one window"],
+    ids=["many windows", "position as it is", "no parallel filter", "all rows", "two joints", "one window", "central"],
 )
-def test_every_window_is_filtered_by_itself(n_joints: int, step: float, filters: dict[str, float | int | None]) -> None:
+def test_every_window_is_filtered_by_itself(
+    n_joints: int, step: float, filters: dict[str, float | int | str | None]
+) -> None:
     measured, wanted = recording(n_joints), job(step, **filters)
     robot, human = wanted.models(measured.joints)
     assert robot is not None

@@ -41,6 +41,7 @@ TRIALS[..., 4:] += TRIALS[..., :2] @ np.array([[2.0, 0.3], [0.1, 1.0]])
 TRIALS[..., 4:] += TRIALS[..., 2:4] @ np.array([[30.0, 5.0], [5.0, 20.0]])
 R = random.normal(size=(5, 3))
 LOW_PASS = signals.butterworth(2, 20.0, 200.0)
+WIDE = signals.design_differentiator(0.6)
 NOISE = np.array([1.0, 0.5, 0.2])
 ARM = models.ArmGeometry((0.3, 0.35))
 XI = np.array([0.3, 0.1, 0.12])
@@ -135,6 +136,7 @@ CASES = [
     Case("signals.filter_zero_phase", lambda x: signals.filter_zero_phase(LOW_PASS, x), W, "the signal"),
     Case("signals.filter_from_zero", lambda x: signals.filter_from_zero(LOW_PASS, x), W, "the signal"),
     Case("signals.central_differences", lambda x: signals.central_differences(x, 200.0), W, "the signal"),
+    Case("signals.differentiate", lambda x: signals.differentiate(x, 200.0, WIDE), W, "the signal"),
     Case("signals.savitzky_golay", lambda x: signals.savitzky_golay(x, 200.0, 1, 40.0, 5), W, "the signal"),
     Case("models.HumanJoint", model(models.HumanJoint(offset=True)), MOTION[:, 0], "the position"),
     Case("models.RobotJoint", model(models.RobotJoint(15.0)), MOTION[:, 0], "the position"),

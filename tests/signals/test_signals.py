@@ -19,7 +19,10 @@ from jaximp.signals import (
     butterworth,
     central_differences,
     cut_signal,
-    differences_in_windows,
+    design_differentiator,
+    differentiate,
+    differentiate_in_windows,
+    differentiate_padded,
     fill_gaps,
     filter_in_windows,
     filter_zero_phase,
@@ -105,7 +108,7 @@ def test_what_is_done_in_windows_can_be_done_one_after_another(shape: tuple[int,
     x, starts, window = 3 + noise(shape).cumsum(axis=0), np.arange(0, 201, 20), 100
     every_other = np.arange(0, window, 2)
     q = filter_in_windows(position, cut_signal(x, starts, window))
-    for k, derivative in enumerate(differences_in_windows(q, RATE)):
+    for k, derivative in enumerate(differentiate_in_windows(q, RATE)):
         found = filter_in_windows(parallel, derivative).at(every_other)
         cuts = (sosfiltfilt(position, x[start : start + window], axis=0) for start in starts)
         expected = np.stack([sosfiltfilt(parallel, central_differences(cut, RATE)[k], axis=0)[::2] for cut in cuts])
@@ -225,6 +228,60 @@ def test_central_differences_of_a_sine_and_their_gradient() -> None:
     np.testing.assert_allclose(ddq[1:-1], -25 * np.sin(5 * t)[1:-1], atol=1e-3)
     matrix = jax.jacobian(lambda q: central_differences(q, RATE)[0])(jnp.asarray(np.sin(t[:6])))
     np.testing.assert_allclose(matrix @ t[:6], 1.0, rtol=1e-9)
+
+
+BANDS = [0.02, 0.2, 0.5, 0.8, 0.95]
+"""Of half the sample rate."""
+
+
+@pytest.mark.parametrize("band", BANDS)
+def test_derivatives_are_right_up_to_the_end_of_their_band(band: float) -> None:
+    by, t = design_differentiator(band), np.arange(2000) / RATE
+    inside = slice(by.half, -by.half)
+    for share in (0.01, 0.3, 0.7, 0.95, 1.0):
+        w = 2 * np.pi * share * band * RATE / 2
+        dq, ddq = differentiate(np.sin(w * t + 0.3), RATE, by)
+        assert np.abs(dq - w * np.cos(w * t + 0.3))[inside].max() < 1e-3 * w
+        assert np.abs(ddq + w**2 * np.sin(w * t + 0.3))[inside].max() < 1e-3 * w**2
+
+
+def test_central_differences_are_not() -> None:
+    w, t = 2 * np.pi * 0.2 * RATE / 2, np.arange(2000) / RATE
+    dq, ddq = (x[1:-1] for x in central_differences(np.sin(w * t), RATE))
+    np.testing.assert_allclose(dq, np.sin(w / RATE) * RATE * np.cos(w * t[1:-1]), atol=1e-6)
+    np.testing.assert_allclose(ddq, -((2 * np.sin(w / RATE / 2) * RATE) ** 2) * np.sin(w * t[1:-1]), atol=1e-3)
+
+
+@pytest.mark.parametrize("band", BANDS)
+def test_a_parabola_is_differentiated_exactly_to_the_ends(band: float) -> None:
+    a, b, c = noise((3, 2))
+    t = (np.arange(300) / RATE)[:, None]
+    dq, ddq = differentiate(a + b * t + c * t**2, RATE, design_differentiator(band))
+    np.testing.assert_allclose(dq, b + 2 * c * t, atol=1e-9)
+    np.testing.assert_allclose(ddq, np.broadcast_to(2 * c, (300, 2)), atol=1e-5)
+
+
+@pytest.mark.parametrize("band", [0.2, 0.8])
+def test_derivatives_are_the_same_padded_in_windows_and_in_jax(band: float) -> None:
+    by, x = design_differentiator(band), noise((500, 2)).cumsum(axis=0)
+    expected = differentiate(x, RATE, by)
+    behind = np.concatenate([x, np.full((77, 2), 1e3)])
+    padded = jax.jit(differentiate_padded)(behind, RATE, 500, by)
+    starts = np.array([0, 20, 399])
+    in_windows = differentiate_in_windows(cut_signal(x, starts, 101), RATE, by)
+    for k, whole in enumerate(expected):
+        largest = np.abs(whole).max()
+        np.testing.assert_allclose(differentiate(jnp.asarray(x), RATE, by)[k], whole, atol=1e-12 * largest)
+        np.testing.assert_allclose(padded[k][:500], whole, atol=1e-12 * largest)
+        cuts = np.stack([differentiate(x[start : start + 101], RATE, by)[k] for start in starts])
+        np.testing.assert_allclose(in_windows[k].at(np.arange(101)), cuts, atol=1e-12 * largest)
+
+
+def test_derivatives_that_cannot_be_had_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"lower filter\.position_cutoff"):
+        design_differentiator(0.9999)
+    with pytest.raises(ValueError, match="32 samples are too few for derivatives: at least 33 are needed"):
+        differentiate(np.zeros(32), RATE, design_differentiator(0.8))
 
 
 @pytest.mark.parametrize("sos", FILTERS)
