@@ -111,7 +111,10 @@ class ChunkFit(NamedTuple):
     share: Array
     """(K,) what the other columns leave of the one that they imitate best, squared and in the chunk's coordinates."""
     statistics: Statistics | None = None
-    unseen: Unseen | None = None
+    seen: Held | None = None
+    """How well parameters that were given explain each window."""
+    unseen: Held | None = None
+    """How well each window's parameters, or those that were given, predict the one `ahead` windows on."""
 
     @property
     def doubtful(self) -> Any:
@@ -135,13 +138,15 @@ class Statistics(NamedTuple):
     samples: Array
 
 
-class Unseen(NamedTuple):
-    """How well each window predicts the one `ahead` windows on; (K,), nothing where that is beyond the chunk."""
+class Held(NamedTuple):
+    """How well parameters explain the torque of a window; (K,), nothing where that is beyond the chunk."""
 
     vaf: Array
+    mean_square: Array
+    """Of the residual."""
     samples: Array
     variance: Array
-    """Of the torque there."""
+    """Of the torque."""
 
 
 def solve_chunk(
@@ -151,13 +156,14 @@ def solve_chunk(
     window: Array | int,
     noise: Array | None = None,
     ahead: Array | int = 0,
+    held: Array | None = None,
 ) -> ChunkFit:
     """Fit every window of a chunk.
 
     **Arguments:** `columns` (p + 1, rows) of W and y, with the rows of several outputs in turn, multiplied by `scale`
     (rows,): zero where a row does not count, else the root of its weight; `window` its length in rows, at most
     `plan.room` blocks; `noise` (lags,) its autocovariance; `ahead`, how many windows on the one lies that each is held
-    against, where the plan `predicts`.
+    against, where the plan `predicts`, by its own parameters or by those in `held` (K, p).
     """
     p = len(columns) - 1
     features, R = _features(plan, columns, scale, noise)
@@ -192,12 +198,12 @@ def solve_chunk(
     state = first, _diagonal(first, p), outside
     if plan.per_block == 1:
         found, later = jax.tree.map(lambda x: x[None], solve(*state, 0))
-        return _in_given_units(_with_unseen(found, later, R, plan, ahead), R, plan)
+        return _in_given_units(_with_predictions(found, later, R, plan, ahead, held), R, plan)
     leaving, entering = (
         x[:, :, : plan.lanes].reshape(plan.per_block, plan.step, len(features), plan.lanes) for x in (blocked, tail)
     )
     found, later = lax.scan(advance, state, (leaving, entering, jnp.arange(plan.per_block) * plan.step))[1]
-    return _in_given_units(_with_unseen(found, later, R, plan, ahead), R, plan)
+    return _in_given_units(_with_predictions(found, later, R, plan, ahead, held), R, plan)
 
 
 class Wanted(NamedTuple):
@@ -629,29 +635,44 @@ def _for_prediction(sums: Rows, p: int, plan: Plan) -> Array:
     return keep(jnp.concatenate(sums[: p + 2 + plan.outputs + plan.weighted]))
 
 
-def _with_unseen(found: ChunkFit, sums: Array, R: Array, plan: Plan, ahead: Array | int) -> ChunkFit:
-    """Hold every window's parameters, in the chunk's coordinates, against the sums of a later one."""
-    p = len(R) - 1
+def _with_predictions(
+    found: ChunkFit, sums: Array, R: Array, plan: Plan, ahead: Array | int, held: Array | None
+) -> ChunkFit:
+    """Hold every window's parameters, or others, against the sums of a later window."""
     if not plan.predicts:
         return found
+    p = len(R) - 1
+    if held is None:
+        return found._replace(unseen=_held(_one_after_another(found.theta, plan).T, sums, R, plan, ahead))
+    inner = ((held @ R[:p, :p].T - R[:p, p]) / R[p, p]).T
+    return found._replace(seen=_held(inner, sums, R, plan, 0), unseen=_held(inner, sums, R, plan, ahead))
+
+
+def _held(theta: Array, sums: Array, R: Array, plan: Plan, ahead: Array | int) -> Held:
+    """Hold parameters (p, K), in the chunk's coordinates, against the sums of the windows `ahead` of theirs."""
+    p = len(theta)
     assert plan.statistics
     sizes = [*range(p + 1, 0, -1), 1, *[p + 2 + plan.outputs] * plan.outputs, *[1] * plan.weighted]
     later = jnp.roll(_one_after_another(sums, plan), -ahead, axis=0).T
     rows = tuple(jnp.split(keep(later), np.cumsum(sizes)[:-1]))
-    inner = list(keep(_one_after_another(found.theta, plan).T))
+    inner = list(keep(theta))
     # The residual is this combination of the chunk's columns; its sum of squares, a quadratic form of theirs.
-    along = [*(-theta for theta in inner), jnp.ones_like(inner[0])]
+    along = [*(-one for one in inner), jnp.ones_like(inner[0])]
     square = sum_of(
         along[i] * ((1 if i == k else 2) * along[k]) * row[k - i]
         for i, row in enumerate(rows[: p + 1])
         for k in range(i, p + 1)
     )
     rss = R[p, p] ** 2 * jnp.maximum(square, 0)
-    _, vaf, total, samples = _residuals(plan, rss, inner, R, rows)
+    weight, vaf, total, samples = _residuals(plan, rss, inner, R, rows)
     whole = jnp.arange(plan.windows) < plan.windows - ahead
-    unseen = Unseen(jnp.where(whole, vaf, jnp.nan), jnp.where(whole, samples, 0), total / jnp.maximum(samples, 1))
-    back = tuple(x.reshape(plan.lanes, plan.per_block).T for x in unseen)
-    return found._replace(unseen=Unseen(*back))
+    found = (
+        jnp.where(whole, vaf, jnp.nan),
+        divided(rss, weight),
+        jnp.where(whole, samples, 0),
+        total / jnp.maximum(samples, 1),
+    )
+    return Held(*(x.reshape(plan.lanes, plan.per_block).T for x in found))
 
 
 def _residuals(plan: Plan, rss: Array, inner: list[Array], R: Array, sums: Rows) -> tuple[Array, Array, Array, Array]:

@@ -330,13 +330,13 @@ def slice_window(arrays: tuple[Array, ...], start: Array, window: int) -> tuple[
 class Score(eqx.Module):
     """How well parameters explain the torque of one window each, whether they have seen it or not."""
 
-    vaf: Float[Array, "*M"]
+    vaf: Float[AnyArray, "*M"]
     """Variance accounted for; NaN where less than a whole window is there or fewer than half its samples are valid."""
-    residual_rms: Float[Array, "*M"]
+    residual_rms: Float[AnyArray, "*M"]
     """Root of the mean squared residual [N m]."""
-    samples: Int[Array, "*M"]
+    samples: Int[AnyArray, "*M"]
     """Torque samples that counted."""
-    variance: Float[Array, "*M"]
+    variance: Float[AnyArray, "*M"]
     """Of the torque [N^2 m^2]."""
 
 

@@ -1,0 +1,168 @@
+"""Noise that follows from its own past: against covariance matrices written out, and against records of known noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, toeplitz
+from scipy.signal import lfilter
+
+from jaximp.least_squares.autoregression import (
+    Autoregression,
+    _likelihood,
+    _stretches,
+    _sums,
+    autoregression_of,
+    fit_window_noise,
+    whiten_rows,
+)
+from jaximp.signals import autocovariance, butterworth
+
+Numbers = NDArray[np.float64]
+NOISE = Autoregression(np.array([-0.8, 0.5, 0.2]))
+
+
+def rows(n: int, seed: int = 0) -> tuple[Numbers, Numbers]:
+    """Columns (n, 3), the last a constant, and a torque."""
+    generator = np.random.default_rng(seed)
+    W = np.column_stack([generator.normal(size=(n, 2)).cumsum(axis=0) / 5, np.ones(n)])
+    return W, generator.normal(size=n)
+
+
+def sample(noise: Autoregression, n: int, generator: np.random.Generator) -> Numbers:
+    """n values of it, at neighbouring rows."""
+    e: Numbers = lfilter([1.0], noise.polynomial, generator.normal(size=n + 1000))[1000:]
+    return e
+
+
+def test_the_autocovariance_is_that_of_the_recursion() -> None:
+    impulse = lfilter([1.0], NOISE.polynomial, np.eye(1, 4000)[0])
+    expected = [impulse[: 4000 - k] @ impulse[k:] for k in range(12)]
+    np.testing.assert_allclose(NOISE.autocovariance(12), np.array(expected) / expected[0], atol=1e-12)
+
+
+def test_the_spectrum_is_that_of_the_autocovariance() -> None:
+    r, f = NOISE.autocovariance(400), np.array([0.0, 7.0, 31.0, 49.0])
+    expected = 2 / 100 * (1 + 2 * (np.cos(2 * np.pi * f[:, None] * np.arange(1, 400) / 100) @ r[1:]))
+    np.testing.assert_allclose(NOISE.spectrum(f, 100.0), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_white_rows_are_those_of_a_cholesky_factor(every: int) -> None:
+    n, (W, y) = 40 * every, rows(40 * every)
+    noise = Autoregression(NOISE.reflections, every)
+    valid = np.ones(n, bool)
+    valid[[5, 17 * every, 17 * every + 1]] = False
+    found = whiten_rows(np.column_stack([W, y]), valid, noise)
+    new = np.prod(1 - noise.reflections**2)
+    for phase in range(every):
+        index = np.arange(phase, n, every)
+        gaps = np.flatnonzero(np.diff(np.flatnonzero(valid[index])) > 1)
+        runs = np.split(index[valid[index]], gaps + 1)
+        covariance = block_diag(*(toeplitz(noise.autocovariance(len(run))) for run in runs)) / new
+        kept = np.concatenate(runs)
+        expected = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([W, y])[kept])
+        np.testing.assert_allclose(found[kept], expected, atol=1e-10)
+    assert (found[~valid] == 0).all()
+
+
+def test_the_restricted_likelihood_is_that_of_the_covariance_matrix() -> None:
+    """Differences between two noises: constants that no noise changes are left out."""
+    n, window = 90, 30
+    (W, y), valid = rows(n), np.ones(n, bool)
+    valid[40] = False
+    stretches = _stretches(valid, window, 1)
+    sums = _sums(np.column_stack([W, y]), stretches, 3, 1)
+    assert sums is not None
+
+    def written_out(noise: Autoregression) -> float:
+        total = 0.0
+        for runs in stretches:
+            V = block_diag(*(toeplitz(noise.autocovariance(len(run))) for run in runs))
+            V /= np.prod(1 - noise.reflections**2)
+            kept = np.concatenate(runs)
+            inverse = np.linalg.inv(V)
+            gram = W[kept].T @ inverse @ W[kept]
+            residual = y[kept] - W[kept] @ np.linalg.solve(gram, W[kept].T @ inverse @ y[kept])
+            freedom = len(kept) - W.shape[1]
+            total += freedom * np.log(residual @ inverse @ residual)
+            total += np.linalg.slogdet(V)[1] + np.linalg.slogdet(gram)[1]
+        return total
+
+    def computed(noise: Autoregression) -> float:
+        return _likelihood(noise.reflections, sums.products, sums)[0]
+
+    other = Autoregression(np.array([0.3, -0.6, 0.1]))
+    assert computed(NOISE) - computed(other) == pytest.approx(written_out(NOISE) - written_out(other), abs=1e-8)
+
+
+def test_the_slopes_of_the_likelihood_are_differences() -> None:
+    (W, y), reflections = rows(200), np.array([0.4, -0.3, 0.2])
+    sums = _sums(np.column_stack([W, y]), _stretches(np.ones(200, bool), 50, 1), 3, 1)
+    assert sums is not None
+    products = sums.products
+    slopes = _likelihood(reflections, products, sums)[1]
+    for k, unit in enumerate(np.eye(3)):
+        high, low = (_likelihood(reflections + sign * 1e-6 * unit, products, sums)[0] for sign in (1, -1))
+        assert slopes[k] == pytest.approx((high - low) / 2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("window", [40, 200])
+def test_the_noise_of_a_long_record_is_found(window: int) -> None:
+    generator = np.random.default_rng(3)
+    W, _ = rows(8000, seed=4)
+    y = W @ [3.0, -2.0, 5.0] + sample(NOISE, 8000, generator)
+    found = fit_window_noise(W, y, np.ones(8000, bool), window)
+    np.testing.assert_allclose(found.polynomial[:4], NOISE.polynomial, atol=0.05)
+
+
+def test_what_the_parameters_took_is_given_back() -> None:
+    """Windows of 30 rows with three parameters take a good part of slow noise; the estimate must not shrink by it."""
+    generator, slow = np.random.default_rng(5), Autoregression(np.array([-0.95]))
+    found = []
+    for seed in range(20):
+        W, _ = rows(1500, seed=seed)
+        y = sample(slow, 1500, generator)
+        valid = np.ones(1500, bool)
+        sums = _sums(np.column_stack([W, y]), _stretches(valid, 30, 1), 1, 1)
+        assert sums is not None
+        grid = np.linspace(-0.99, -0.6, 40)
+        found.append(grid[np.argmin([_likelihood(np.array([one]), sums.products, sums)[0] for one in grid])])
+    assert np.mean(found) == pytest.approx(-0.95, abs=0.02)
+
+
+def test_a_change_of_the_parameters_is_no_noise() -> None:
+    generator = np.random.default_rng(6)
+    W, _ = rows(4000, seed=7)
+    theta = np.where(np.arange(4000)[:, None] < 2000, [1.0, 2.0, 3.0], [9.0, -2.0, 0.0])
+    y = (W * theta).sum(axis=1) + generator.normal(size=4000)
+    assert fit_window_noise(W, y, np.ones(4000, bool), 200).order == 0
+    assert fit_window_noise(W, y, np.ones(4000, bool), 4000 // 20 * 19).order > 0
+
+
+def test_white_noise_and_few_rows_need_no_autoregression() -> None:
+    generator = np.random.default_rng(8)
+    W, _ = rows(60, seed=9)
+    assert fit_window_noise(W, generator.normal(size=60), np.ones(60, bool), 12).order == 0
+    assert fit_window_noise(W, generator.normal(size=60), np.zeros(60, bool), 12).order == 0
+
+
+def test_a_window_without_motion_and_one_without_noise_harm_nothing() -> None:
+    generator = np.random.default_rng(10)
+    W, _ = rows(1200, seed=11)
+    W[200:400, :2] = 0
+    y = W @ [1.0, 2.0, 3.0] + sample(NOISE, 1200, generator)
+    y[600:800] = W[600:800] @ [1.0, 2.0, 3.0]
+    found = fit_window_noise(W, y, np.ones(1200, bool), 200)
+    assert np.isfinite(found.reflections).all()
+    assert (np.abs(found.reflections) < 1).all()
+
+
+def test_what_filters_made_of_white_noise_is_known() -> None:
+    sos = butterworth(4, 20.0, 1000.0)
+    known = autoregression_of(autocovariance(sos, 10), every=2)
+    r = np.pad(autocovariance(sos, 20), (0, 40))[:40]
+    assert known.every == 2
+    np.testing.assert_allclose(known.autocovariance(known.order + 1), r[: known.order + 1], atol=1e-9)
+    np.testing.assert_allclose(known.autocovariance(20), r[:20], atol=0.02)
