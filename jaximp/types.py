@@ -6,7 +6,7 @@ Shapes, everywhere in jaximp: time is axis 0. `N` samples, `M` windows, `S` samp
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,6 +72,11 @@ class Recording:
 
 MOST_CHOICES = 50
 """How many choices a hint names."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """a, b and c."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def nearest(name: str, choices: list[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
@@ -74,15 +75,16 @@ def _identify_trials_into(job: Job, folder: Path) -> None:
 def _say_result(estimates: Estimates) -> None:
     counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
     typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
-    complaint = estimates.verdicts.complaint()
+    complaint, shown = estimates.verdicts.complaint(), estimates.summarised()
     if complaint:
         typer.echo(complaint)
+    means, sds = shown.mean_over_trusted(), shown.sd_over_trusted()
+    if not any(map(math.isfinite, means)):
         return
     typer.echo("mean and standard deviation over the trusted windows:")
-    shown = estimates.summarised()
-    found = zip(shown.names, shown.units, shown.mean_over_trusted(), shown.sd_over_trusted(), strict=True)
-    for name, unit, mean, sd in found:
-        typer.echo(f"{name:>20} {mean:11.4g} ({sd:.2g}) {unit}")
+    for name, unit, mean, sd in zip(shown.names, shown.units, means, sds, strict=True):
+        said = f"{mean:11.4g} ({sd:.2g}) {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"
+        typer.echo(f"{name:>20} {said}")
 
 
 def _say_impedance(found: ArmImpedance) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import equinox as eqx
@@ -15,8 +16,9 @@ from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
+from jaximp.trust.score_tests import Misfit
 from jaximp.trust.verdicts import Verdicts, worst
-from jaximp.trust.window_rules import Windows, judge_windows
+from jaximp.trust.window_rules import NOTHING_MISSING, Windows, judge_windows
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,10 @@ class Estimates(Result):
     robot_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     """What a reader must know of these numbers, in plain words."""
+    misfits: tuple[Misfit, ...] = ()
+    """Tests of the model over the whole record, where its noise was estimated."""
+    lacking: Mapping[str, str] = field(default_factory=dict)
+    """Parameters that what the model lacks moves beyond error and a share that matters, and why, in words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
 
@@ -132,6 +138,11 @@ class Estimates(Result):
     def trusted(self) -> NDArray[np.bool_]:
         """(M,) which windows break no rule."""
         return self.verdicts.trusted
+
+    def trusted_in(self, name: str) -> NDArray[np.bool_]:
+        """(M,) which windows can be trusted in one parameter: what the model lacks may spare it."""
+        spared = name not in self.lacking and self.verdicts.rule == NOTHING_MISSING
+        return np.asarray(self.verdicts.trusted | spared)
 
     @property
     def human_joints(self) -> list[HumanPart]:
@@ -218,11 +229,12 @@ class Estimates(Result):
         )
 
     def mean_over_trusted(self) -> NDArray[np.float64]:
-        """(p,) mean of each parameter over the trusted windows; NaN if there are none."""
-        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
-        return theta.mean(axis=0) if len(theta) else np.full(len(self.names), np.nan)
+        """(p,) mean of each parameter over the windows that can be trusted in it; NaN if there are none."""
+        return np.array([column.mean() if len(column) else np.nan for column in self._trusted_columns()])
 
     def sd_over_trusted(self) -> NDArray[np.float64]:
-        """(p,) standard deviation of each parameter over the trusted windows; NaN if there are none."""
-        theta = np.asarray(self.fit.theta)[self.verdicts.trusted]
-        return theta.std(axis=0) if len(theta) else np.full(len(self.names), np.nan)
+        """(p,) standard deviation of each parameter over the same windows; NaN if there are none."""
+        return np.array([column.std() if len(column) else np.nan for column in self._trusted_columns()])
+
+    def _trusted_columns(self) -> list[NDArray[np.float64]]:
+        return [self.value[self.trusted_in(name), k] for k, name in enumerate(self.names)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,23 +18,27 @@ from numpy.typing import NDArray
 
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
+from jaximp.identification.misfit import find_misfits, harmless, in_words, missing, off_by, unnoticed
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
-from jaximp.identification.separation import METHODS, Regression, Separation, fit_robot, separate
+from jaximp.identification.separation import METHODS, Regression, Separation, Whiten, fit_robot, separate
 from jaximp.identification.solving import (
     MOST_ROWS,
     Placement,
     Solved,
+    Task,
     moments,
     place_windows,
     solve_stack,
 )
+from jaximp.identification.whitening import White, from_white, whiten
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.criteria import fake_change_threshold
-from jaximp.trust.window_rules import measure_windows
+from jaximp.trust.score_tests import Misfit
+from jaximp.trust.window_rules import judge_together, judged_names, measure_windows
 from jaximp.types import Progress, Recording, nearest
 
 CLEAR = 2.0
@@ -82,6 +87,8 @@ class Prepared:
     reference: ReferenceMotion
     jumps: NDArray[np.bool_]
     """(N,) where the position jumps."""
+    white: tuple[White, ...] = ()
+    """Rows whose noise is white, of each joint (of joints side by side), where the pipeline whitens."""
     solved: tuple[Solved, ...] = ()
     """One for each joint (of joints side by side), where the windows of the pipeline are solved already."""
 
@@ -134,7 +141,17 @@ def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
 
 def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: _Pair | None = None) -> Prepared:
     recording, pipeline = measured.recording, measured.pipeline
-    return Prepared(recording, pipeline, rows, noise, pair, pipeline.reference_motion(recording), measured.jumps)
+    reference = pipeline.reference_motion(recording)
+    white = tuple(_whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
+    if white:
+        noise = np.concatenate([one.column_noise for one in white])
+    return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
+
+
+def _whitened(pipeline: Pipeline, rows: Rows) -> Iterator[White]:
+    """White rows of each joint of joints side by side, which share neither parameters nor noise."""
+    for columns in _columns_by_joint(pipeline.model):
+        yield whiten(pipeline, rows if columns is None else rows.of_joint(*columns))
 
 
 def solve_windows(
@@ -145,13 +162,19 @@ def solve_windows(
     **Arguments:** `padded` rows to which each is filled up, in a stack of so many; `longest` [s], where other lengths
     of up to so much follow: they will share the compiled code.
     """
-    first = several[0]
+    first, found = several[0], []
     padded = len(first.rows.time) if padded is None else padded
-    noise, found = [one.pipeline.filters.noise for one in several], []
-    for columns in _columns_by_joint(first.model):
-        own = [one.rows if columns is None else one.rows.of_joint(*columns) for one in several]
-        found.append(solve_stack(own, noise, place_windows(first.pipeline, own[0], longest), padded, stacked))
+    for j, columns in enumerate(_columns_by_joint(first.model)):
+        tasks = [_task(one, one.rows if columns is None else one.rows.of_joint(*columns), j) for one in several]
+        found.append(solve_stack(tasks, place_windows(first.pipeline, tasks[0].rows, longest), padded, stacked))
     return [replace(one, solved=solved) for one, solved in zip(several, zip(*found, strict=True), strict=True)]
+
+
+def _task(prepared: Prepared, rows: Rows, j: int) -> Task:
+    """What is to be solved of one joint."""
+    if prepared.white:
+        return Task(rows, white=prepared.white[j])
+    return Task(rows, prepared.pipeline.filters.noise)
 
 
 def _columns_by_joint(model: Model) -> list[tuple[int, slice] | None]:
@@ -180,20 +203,38 @@ def in_windows(
     rows = prepared.rows
     place = place_windows(prepared.pipeline, rows, longest)
     if prepared.solved:
-        return [_estimates(prepared, rows, prepared.solved[0], place, curves=curves)]
+        misfits = _misfits(prepared, prepared.solved[0].fit)
+        return [_estimates(prepared, rows, prepared.solved[0], place, curves=curves, misfits=misfits)]
     if prepared.pair is not None:
         return _by_methods(prepared, prepared.pair, place, progress, curves)
 
-    def solve(W: Array) -> SlidingFit:
-        valid, noise = jnp.asarray(rows.valid), prepared.noise
-        return sliding_least_squares(
-            W, rows.torque, place.window, place.step, valid=valid, noise=noise, room=_room(place)
-        )
+    white = prepared.white[0] if prepared.white else None
+    solve = partial(sliding_least_squares, window=place.window, step=place.step, room=_room(place))
+    solve = partial(solve, valid=jnp.asarray(rows.valid), noise=None if white else prepared.noise)
+    W, torque = (jnp.asarray(x) for x in ((white.W, white.torque) if white else (rows.W, rows.torque)))
+    fit = solve(W, torque)
+    gain = solve(with_gain(prepared.model, W), torque) if prepared.model.memory else None
+    ordinary = None
+    if white:
+        ordinary = solve(jnp.asarray(rows.W), rows.torque)
+        seen = score(rows.W, rows.torque, rows.valid, fit.theta, place.starts, place.window, place.step, _room(place))
+        fit = from_white(fit, ordinary, white, seen)
+        gain = None if gain is None else from_white(gain, ordinary, replace(white, inflation=np.ones(1)))
+    solved, misfits = _predict(rows, fit, place)._replace(ordinary=ordinary), _misfits(prepared, fit)
+    return [_estimates(prepared, rows, solved, place, gain=gain, curves=curves, misfits=misfits)]
 
-    W = jnp.asarray(rows.W)
-    fit = solve(W)
-    gain = solve(with_gain(prepared.model, W)) if prepared.model.memory else None
-    return [_estimates(prepared, rows, _predict(rows, fit, place), place, gain=gain, curves=curves)]
+
+def _misfits(prepared: Prepared, fit: SlidingFit) -> tuple[Misfit, ...]:
+    """What the model of one joint lacks; nothing is known of others, or without white rows."""
+    if not prepared.white or prepared.recording.n_joints != 1:
+        return ()
+    (white,), rows = prepared.white, prepared.rows
+    theta = np.asarray(fit.theta)
+    known = theta[np.isfinite(theta).all(axis=1)]
+    if not len(known):
+        return ()
+    usual = np.median(known, axis=0)
+    return find_misfits(prepared.pipeline, prepared.recording, white.W, white.torque, white, rows.valid, usual)
 
 
 def _room(place: Placement) -> int | None:
@@ -202,13 +243,15 @@ def _room(place: Placement) -> int | None:
 
 def _by_methods(prepared: Prepared, pair: _Pair, place: Placement, progress: Progress, curves: bool) -> list[Estimates]:
     """The human in the robot, by every method that is asked for."""
-    rows, noise, methods = prepared.rows, prepared.noise, prepared.pipeline.methods
+    rows, methods = prepared.rows, prepared.pipeline.methods
+    noise = None if prepared.pipeline.whitens else prepared.noise
     merge = combine(pair.robot, prepared.model).merge
     results = []
     for count, method in enumerate(methods):
 
         def solve_pair(alone: Regression, loaded: Regression, method: int = method) -> Separation:
-            return separate(method, pair.robot_fit, alone, loaded, merge, place.window, place.step, noise, _room(place))
+            given = (merge, place.window, place.step, noise, _room(place), _whitener(prepared.pipeline))
+            return separate(method, pair.robot_fit, alone, loaded, *given)
 
         found, gain = solve_pair(pair.alone, pair.loaded), None
         if prepared.model.memory:
@@ -217,11 +260,21 @@ def _by_methods(prepared: Prepared, pair: _Pair, place: Placement, progress: Pro
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
         solved = _predict(human, found.fit, place)
-        notes = (METHODS[method], found.warning)
-        estimates = _estimates(prepared, human, solved, place, method, *notes, gain=gain, curves=curves)
+        notes, own = (METHODS[method], found.warning), prepared
+        if found.white is not None and rows.noisy is not None:
+            noisy = found.white.apply(rows.noisy[:n, len(pair.robot.names) :], rows.valid[:n])
+            own = replace(prepared, column_noise=np.sqrt((noisy**2).mean(axis=0)))
+        estimates = _estimates(own, human, solved, place, method, *notes, gain=gain, curves=curves)
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(methods))
     return results
+
+
+def _whitener(pipeline: Pipeline) -> Whiten | None:
+    """What makes white rows of any columns, where the noise's shape is to be estimated."""
+    if not pipeline.whitens:
+        return None
+    return lambda W, y, valid: whiten(pipeline, Rows(W, y, np.asarray(valid), np.empty(0)))
 
 
 def _joint_by_joint(
@@ -257,6 +310,7 @@ def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Pre
         rows=prepared.rows.of_joint(j, columns),
         column_noise=prepared.column_noise[columns],
         reference=_of_joint(prepared.reference, this),
+        white=prepared.white[this],
         solved=prepared.solved[this],
     )
 
@@ -298,6 +352,10 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         names=model.names,
         units=model.units,
         fit=fit,
+        misfits=tuple(
+            replace(one, group=f"joint {j + 1}: {one.group}") for j, part in enumerate(parts) for one in part.misfits
+        ),
+        lacking={f"joint{j + 1}.{name}": why for j, part in enumerate(parts) for name, why in part.lacking.items()},
         held_out_vaf=np.min([part.held_out_vaf for part in parts], axis=0),
         measured=tuple(windows for part in parts for windows in part.measured),
         threshold=max(thresholds, default=None),
@@ -334,9 +392,7 @@ def at_other_lengths(
         other = replace(other, methods=other.methods[:1])
         with suppress(ValueError):
             other.check(prepared.recording)
-            shared = replace(prepared, pipeline=other, solved=())
-            if not other.once:
-                shared = prepare(other, prepared.recording, alone)
+            shared = with_windows(prepared, other) if other.once else prepare(other, prepared.recording, alone)
             return in_windows(shared, longest=max(factors) * length)
         return []
 
@@ -345,6 +401,12 @@ def at_other_lengths(
         found += identified(factor)
         progress((count + 1) / len(factors))
     return found
+
+
+def with_windows(prepared: Prepared, pipeline: Pipeline) -> Prepared:
+    """The same rows for windows of another length, whose noise is estimated from what they leave."""
+    white = tuple(_whitened(pipeline, prepared.rows)) if prepared.white else ()
+    return replace(prepared, pipeline=pipeline, white=white, solved=())
 
 
 def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:
@@ -363,8 +425,8 @@ def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone:
     # The robot's own parameters come from its whole recording, which needs no windows.
     whole_record = once(pipeline)
     whole = regress_pair(whole_record, robot, alone)[0]
-    known = noise_of(whole_record)
-    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known))
+    known = None if pipeline.whitens else noise_of(whole_record)
+    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), _whitener(pipeline))
     # Methods 1 and 2 need no windows of the robot alone.
     shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
     in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
@@ -404,27 +466,37 @@ def _estimates(
     *notes: str,
     gain: SlidingFit | None = None,
     curves: bool = True,
+    misfits: tuple[Misfit, ...] = (),
 ) -> Estimates:
     """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
     recording, pipeline, model = prepared.recording, prepared.pipeline, prepared.model
-    fit, unseen, whole = solved
+    fit, unseen, whole = solved[:3]
     starts = place.starts[: len(fit.last)]
     held_out = np.where(np.asarray(unseen.variance) > STILL * whole.torque, np.asarray(unseen.vaf), np.nan)
-    if method in (2, 4):  # these solve for more than the human: judge them by the human's torque, as the others
+    # Methods 2 and 4 solve for more than the human, and white rows are other rows: the human's torque judges them all.
+    if method in (2, 4) or (method is not None and pipeline.whitens):
         valid = jnp.asarray(rows.valid)
         seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, _room(place))
         quality = (seen.vaf, seen.residual_rms, seen.samples)
         fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
     threshold, why_not = _threshold(prepared, place, method)
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
-    limits = pipeline.limits
+    limits, weights = pipeline.limits, {model.names[k] for reflex in reflexes for k in reflex.columns}
     if reflexes and not limits.parameters:
         # Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one.
-        limits = replace(limits, parameters=tuple(np.delete(model.names, reflexes[0].columns).tolist()))
+        kept = [name for name, role in zip(model.names, model.roles, strict=True) if role.kind != "offset"]
+        limits = replace(limits, parameters=tuple(name for name in kept if name not in weights))
     full = place.counted * model.n_joints
     measured = measure_windows(
         fit, model.names, model.roles, full, whole.parameter_scale, prepared.column_noise, threshold, limits
     )
+    size = np.abs(np.nanmedian(np.asarray(fit.theta), axis=0)) if misfits else np.zeros(0)
+    of_model = (misfits, model.names, size)
+    off, judged = off_by(*of_model), judged_names(model, limits)
+    why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
+    measured = replace(measured, tested=bool(misfits), missing=why, remedy=remedy)
+    apart = -(-place.window // place.step) if not place.separate else max(1, int(place.next_starts[0] // place.window))
+    measured = judge_together(measured, fit, model.roles, np.asarray(held_out), apart)
     jumps = jump_note(recording, prepared.jumps)
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
@@ -446,9 +518,11 @@ def _estimates(
         predicted=predicted,
         notes=(
             *recording.notes,
-            *filter(None, (jumps, _literal_note(pipeline), why_not, *notes)),
+            *filter(None, (jumps, _literal_note(pipeline), why_not, harmless(*of_model), unnoticed(*of_model), *notes)),
         ),
         reflexes=reflexes,
+        misfits=misfits,
+        lacking={name: in_words(misfits, {name: share}) for name, share in off.items() if name not in weights},
     )
     about = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
     return replace(estimates, notes=estimates.notes + about) if about else estimates

@@ -14,8 +14,10 @@ from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
 from jaximp.trust.limits import TrustLimits
-from jaximp.types import AnyArray, Recording
+from jaximp.types import AnyArray, Recording, nearest
 
+NOISE = ["estimated", "filtered"]
+"""Choices of `WindowSettings.noise`."""
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
@@ -28,6 +30,9 @@ class WindowSettings:
     """Length of the sliding window [s]."""
     step: float | None = None
     """From one window to the next [s]; by default a fiftieth of the length."""
+    noise: str = "estimated"
+    """Of the torque: `estimated` from what windows leave of it, whatever its colour, for generalised least squares;
+    `filtered` takes it as white before the filters, for ordinary least squares as in the paper."""
     min_velocity: float = 0.0
     """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
 
@@ -67,6 +72,11 @@ class Pipeline:
     def once(self) -> bool:
         """Whether the filters run over the recording once, and not inside every window."""
         return self.filter.mode == "once"
+
+    @property
+    def whitens(self) -> bool:
+        """Whether the noise is estimated, and windows are solved in rows where it is white."""
+        return self.once and self.window.noise == "estimated"
 
     @property
     def window_samples(self) -> int:
@@ -109,6 +119,8 @@ class Pipeline:
                 f"the pipeline is for {self.sample_rate:g} Hz, but the recording has {recording.sample_rate:g} Hz: "
                 "make one for its sample rate"
             )
+        if self.window.noise not in NOISE:
+            raise ValueError(f"window.noise is '{self.window.noise}': {nearest(self.window.noise, NOISE)}")
         design_filters(self.filter, self.sample_rate)
         if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
             _check_elbow(recording)
@@ -146,7 +158,7 @@ class Pipeline:
         reference = recording.reference[: round(self.reference * rate)]
         if len(reference) < round(self.reference * rate) or not np.isfinite(reference).all():
             return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
-        return reference, *signals.central_differences(reference, rate)
+        return reference, *signals.differentiate(reference, rate, self.filters.differentiator)
 
 
 def _check_elbow(recording: Recording) -> None:

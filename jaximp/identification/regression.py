@@ -36,6 +36,9 @@ from jaximp.types import AnyArray, Recording
 
 T = TypeVar("T")
 
+FINEST = 1e-6
+"""No sensor is finer than this share of what it measured: less is no motion."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -364,7 +367,7 @@ def with_noise(motion: Motion, levels: Sequence[float] | None = None) -> Motion:
         if x is not None:
             sizes = [signals.noise_level(column) for column in x.T] if known is None else known
             white = numbers[used : used + x.size].reshape(x.shape[::-1]).T
-            x, used = x + np.asarray(sizes) * white, used + x.size
+            x, used = x + np.maximum(sizes, FINEST * np.nanstd(x, axis=0)) * white, used + x.size
         spoilt.append(x)
     velocity, acceleration, position = spoilt
     assert position is not None

@@ -7,6 +7,7 @@ regressions: rows of the robot's and the human's model, and the motor's torque.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Num
 
+from jaximp.identification.whitening import White, from_white, with_sizes_of_one
 from jaximp.least_squares.sliding import sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit, least_squares
 from jaximp.types import AnyArray
@@ -48,16 +50,30 @@ class Separation(eqx.Module):
 
     fit: SlidingFit
     """Estimates; the standard errors include the uncertainty of the robot's parameters."""
+    white: White | None = eqx.field(static=True)
+    """The rows that estimates come from, of the recording with the human last; None where they are those given."""
     torque: Float[Array, " N"]
     """The torque that the human's model had to explain [N m] (for methods 2 and 4 that of method 1)."""
     warning: str = eqx.field(static=True, default="")
     """Why the method should not be believed here, or nothing."""
 
 
-def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None) -> WindowFit:
-    """Parameters of the robot from the whole recording R, as methods 1 and 2 begin."""
+Whiten = Callable[[AnyArray, AnyArray, AnyArray], White]
+"""White rows of columns, torque and which of them count."""
+
+
+def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None, whiten: Whiten | None = None) -> WindowFit:
+    """Parameters of the robot from the whole recording R, as methods 1 and 2 begin.
+
+    **Arguments:** `noise` its autocovariance by lag in rows, or `whiten` where its shape is to be estimated.
+    """
     # Compiled in one piece: every operation for itself takes many times as long to compile.
-    fit = jax.jit(least_squares)(alone.robot, alone.torque, alone.valid, noise)
+    solve = jax.jit(least_squares)
+    if whiten is None:
+        fit = solve(alone.robot, alone.torque, alone.valid, noise)
+    else:
+        white = whiten(alone.robot, alone.torque, alone.valid)
+        fit = with_sizes_of_one(solve(white.W, white.torque, alone.valid, None), white)
     if not bool(jnp.isfinite(fit.theta).all()):
         raise ValueError(
             "the recording of the robot alone does not determine the robot's parameters: "
@@ -76,66 +92,83 @@ def separate(
     step: int = 1,
     noise: Num[AnyArray, "..."] | None = None,
     room: int | None = None,
+    whiten: Whiten | None = None,
 ) -> Separation:
     """Identify the human by one of the four methods.
 
     **Arguments:** `robot`, the fit of the robot alone (`fit_robot`); `alone` (R) and `loaded` (RH); `merge`, the map
     of `models.combine(robot, human)` that method 2 needs; `window`, `step`, `noise` and `room`
-    as in `sliding_least_squares`, in rows of the regressions.
+    as in `sliding_least_squares`, in rows of the regressions; `whiten` where the noise's shape is to be estimated.
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: the paper has methods 1, 2, 3 and 4")
-    slide = Partial(sliding_least_squares, window=window, step=step, noise=noise, room=room)
+    slide = _Slide(Partial(sliding_least_squares, window=window, step=step, noise=noise, room=room), whiten)
     torque = loaded.torque - loaded.robot @ robot.theta
     if method == 1:
-        fit = _robot_first(robot, loaded, torque, slide)
-        return Separation(fit, torque)
+        return Separation(*_robot_first(robot, loaded, torque, slide), torque)
     if method == 2:
-        fit = _difference_of_parameters(robot, loaded, merge, slide)
-        return Separation(fit, torque)
+        return Separation(*_difference_of_parameters(robot, loaded, merge, slide), torque)
     alone, loaded, shorter = _same_length(alone, loaded)
     if method == 3:
         torque = loaded.torque - alone.torque
         valid = alone.valid & loaded.valid
-        fit = slide(loaded.human, torque, valid=valid)
-        return Separation(
-            fit, torque, "; ".join(filter(None, [_motions_differ(robot, alone, loaded, torque), shorter]))
-        )
-    fit = _augmented(alone, loaded, slide)
-    return Separation(fit, torque[: len(loaded.torque)], shorter)
+        fit, white = slide(loaded.human, torque, valid)
+        warning = "; ".join(filter(None, [_motions_differ(robot, alone, loaded, torque), shorter]))
+        return Separation(fit, white, torque, warning)
+    return Separation(*_augmented(alone, loaded, slide), torque[: len(loaded.torque)], shorter)
 
 
-def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: Callable[..., SlidingFit]) -> SlidingFit:
+@dataclass(frozen=True)
+class _Slide:
+    """How all windows are solved: as the rows are, or in white rows."""
+
+    plain: Callable[..., SlidingFit]
+    whiten: Whiten | None
+
+    def __call__(self, W: Array, y: Array, valid: Array) -> tuple[SlidingFit, White | None]:
+        """Estimates, with the condition number of the rows as they are."""
+        ordinary = self.plain(W, y, valid=valid)
+        if self.whiten is None:
+            return ordinary, None
+        white = self.whiten(W, y, valid)
+        fit = self.plain(jnp.asarray(white.W), jnp.asarray(white.torque), valid=valid)
+        return from_white(fit, ordinary, white), white
+
+
+def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: _Slide) -> tuple[SlidingFit, White | None]:
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
-    fit = slide(loaded.human, torque, valid=loaded.valid)
-    passed_on = _explained_by_the_human(slide, loaded)
+    fit, white = slide(loaded.human, torque, loaded.valid)
+    human, columns = loaded.human, loaded.robot
+    if white is not None:
+        human, columns = jnp.asarray(white.W), jnp.asarray(white.apply(columns, loaded.valid))
+    passed_on = _explained_by_the_human(slide.plain, human, columns, loaded.valid)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
-    return _with_inherited_variance(fit, inherited, robot.dof)
+    return _with_inherited_variance(fit, inherited, robot.dof), white
 
 
 @eqx.filter_jit
-def _explained_by_the_human(slide: Callable[..., SlidingFit], loaded: Regression) -> Array:
+def _explained_by_the_human(slide: Callable[..., SlidingFit], human: Array, columns: Array, valid: Array) -> Array:
     """The human's parameters that imitate each of the robot's columns, (r, M, h); the noise has no part in them."""
 
     def response(column: Array) -> Array:
-        return slide(loaded.human, column, valid=loaded.valid, noise=None).theta
+        return slide(human, column, valid=valid, noise=None).theta
 
-    return jax.lax.map(response, loaded.robot.T)
+    return jax.lax.map(response, columns.T)
 
 
 def _difference_of_parameters(
     robot: WindowFit,
     loaded: Regression,
     merge: tuple[tuple[float, ...], ...],
-    slide: Callable[..., SlidingFit],
-) -> SlidingFit:
+    slide: _Slide,
+) -> tuple[SlidingFit, White | None]:
     """Method 2. `merge` says which column of the merged model each parameter went into."""
     place = np.argmax(np.asarray(merge), axis=0)
     n_robot = loaded.robot.shape[1]
     robot_place, human_place = place[:n_robot], place[n_robot:]
     both = jnp.concatenate([loaded.robot, loaded.human], axis=1)
     first_member = jnp.array([np.flatnonzero(row)[0] for row in np.asarray(merge)])
-    fit = slide(both[:, first_member], loaded.torque, valid=loaded.valid)
+    fit, white = slide(both[:, first_member], loaded.torque, loaded.valid)
 
     shared = np.asarray(human_place)[:, None] == np.asarray(robot_place)[None, :]  # (h, r)
     robot_variance = jnp.diagonal(robot.covariance)
@@ -149,23 +182,24 @@ def _difference_of_parameters(
         ),
     )
     inherited = jnp.broadcast_to(shared @ robot_variance, human.theta.shape)
-    return _with_inherited_variance(human, inherited, robot.dof)
+    return _with_inherited_variance(human, inherited, robot.dof), white
 
 
-def _augmented(alone: Regression, loaded: Regression, slide: Callable[..., SlidingFit]) -> SlidingFit:
+def _augmented(alone: Regression, loaded: Regression, slide: _Slide) -> tuple[SlidingFit, White | None]:
     """Method 4: the two recordings are two outputs that share the robot's parameters."""
     upper = jnp.concatenate([alone.robot, jnp.zeros_like(loaded.human)], axis=1)
     lower = jnp.concatenate([loaded.robot, loaded.human], axis=1)
     W = jnp.stack([upper, lower], axis=1)
     y = jnp.stack([alone.torque, loaded.torque], axis=1)
     valid = jnp.stack([alone.valid, loaded.valid], axis=1)
-    fit = slide(W, y, valid=valid)
+    fit, white = slide(W, y, valid)
     n_robot = loaded.robot.shape[1]
-    return eqx.tree_at(
+    human = eqx.tree_at(
         lambda f: (f.theta, f.stderr, f.excitation),
         fit,
         (fit.theta[:, n_robot:], fit.stderr[:, n_robot:], fit.excitation[:, n_robot:]),
     )
+    return human, white
 
 
 def _with_inherited_variance(fit: SlidingFit, inherited: Array, robot_dof: Array) -> SlidingFit:

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from jaximp.identification.literal import rows_away_from_ends
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows, first_call, on_every_device
-from jaximp.least_squares.chunks import LONGEST_REACH, Task, finish
+from jaximp.identification.whitening import White, from_white
+from jaximp.least_squares.chunks import LONGEST_REACH, finish
+from jaximp.least_squares.chunks import Task as ChunkTask
 from jaximp.least_squares.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, solve_chunk
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares, window_starts
 from jaximp.least_squares.window import SlidingFit, check_finite, variance_accounted_for
@@ -120,6 +122,8 @@ class Solved(NamedTuple):
     unseen: Score
     """How well each window's parameters predict the torque of the window behind it."""
     moments: Moments
+    ordinary: SlidingFit | None = None
+    """Ordinary least squares beside estimates from white rows."""
 
 
 class Layout(NamedTuple):
@@ -159,44 +163,41 @@ class _Stack(eqx.Module):
     y: AnyArray
     valid: AnyArray
     noise: AnyArray | None
+    white: tuple[AnyArray, AnyArray] | None
+    """Columns and torque in rows whose noise is white."""
     window: AnyArray
 
 
-def solve_stack(
-    several: Sequence[Rows],
-    noise: Sequence[NDArray[np.float64] | None],
-    place: Placement,
-    padded: int,
-    stacked: int,
-) -> list[Solved]:
+@dataclass(frozen=True)
+class Task:
+    """What is to be solved of one recording."""
+
+    rows: Rows
+    noise: NDArray[np.float64] | None = None
+    """Its autocovariance by lag in rows; None for noise that is white."""
+    white: White | None = None
+    """The rows that estimates come from, where they are others."""
+
+
+def solve_stack(several: Sequence[Task], place: Placement, padded: int, stacked: int) -> list[Solved]:
     """All windows of recordings whose windows have the same numbers of rows.
 
-    **Arguments:** `noise` of each, by lag in rows; `place` of the first, whose window, step and room are those of all;
-    `padded` rows to which each is filled up; a stack that is not full is filled with copies of the first.
+    **Arguments:** `place` of the first, whose window, step and room are those of all; `padded` rows to which each is
+    filled up; a stack that is not full is filled with copies of the first.
     """
-    for rows in several:
-        check_finite(rows.W, rows.torque, rows.valid)
+    for one in several:
+        check_finite(one.rows.W, one.rows.torque, one.rows.valid)
     first = several[0]
-    lags = 0 if noise[0] is None else max(len(x) for x in noise if x is not None)
-    outputs = int(np.prod(first.torque.shape[1:]))
+    lags = max((0 if one.noise is None else len(one.noise)) for one in several)
+    outputs = int(np.prod(first.rows.torque.shape[1:]))
     layout = make_layout(padded, outputs, place, lags)
-    stack = _stacked(several, noise, place, layout, padded, stacked)
+    stack = _stacked(several, place, layout, padded, stacked)
     with first_call("solve", layout, *(x.shape for x in jax.tree.leaves(stack))):
         found = jax.tree.map(np.asarray, _program(layout, stack))
-    return [
-        _finished(rows, own, jax.tree.map(lambda x, k=k: x[k], found), place, layout)
-        for k, (rows, own) in enumerate(zip(several, noise, strict=True))
-    ]
+    return [_finished(one, jax.tree.map(lambda x, k=k: x[k], found), place, layout) for k, one in enumerate(several)]
 
 
-def _stacked(
-    several: Sequence[Rows],
-    noise: Sequence[NDArray[np.float64] | None],
-    place: Placement,
-    layout: Layout,
-    padded: int,
-    stacked: int,
-) -> _Stack:
+def _stacked(several: Sequence[Task], place: Placement, layout: Layout, padded: int, stacked: int) -> _Stack:
     def together(arrays: Sequence[AnyArray], size: int) -> AnyArray:
         whole = np.zeros((stacked, size, *arrays[0].shape[1:]), arrays[0].dtype)
         for k, array in enumerate(arrays):
@@ -204,12 +205,14 @@ def _stacked(
         whole[len(arrays) :] = whole[0]
         return whole
 
-    lags = [np.asarray(one) for one in noise if one is not None]
+    lags = [np.asarray(one.noise) for one in several if one.noise is not None]
+    white = [(one.white.W, one.white.torque) for one in several if one.white is not None]
     return _Stack(
-        W=together([rows.W for rows in several], padded),
-        y=together([rows.torque for rows in several], padded),
-        valid=together([rows.valid for rows in several], padded),
+        W=together([one.rows.W for one in several], padded),
+        y=together([one.rows.torque for one in several], padded),
+        valid=together([one.rows.valid for one in several], padded),
         noise=together(lags, layout.lags) if lags else None,
+        white=(together([W for W, _ in white], padded), together([y for _, y in white], padded)) if white else None,
         window=np.full(stacked, place.window),
     )
 
@@ -219,27 +222,44 @@ def _program(layout: Layout, stack: _Stack) -> Any:
     """Fits and predictions of all windows and moments of all rows, one recording after another."""
 
     def solve(one: _Stack) -> Any:
-        return *_solved(layout, one), moments(one.W, one.y, one.valid)
+        return (*_solved(layout, one), moments(one.W, one.y, one.valid))
 
     return on_every_device(partial(lax.map, solve), stack, len(stack.window))
 
 
-def _solved(layout: Layout, one: _Stack) -> tuple[Any, Score]:
-    """Fits of all windows of one recording, and how they predict."""
+def _solved(layout: Layout, one: _Stack) -> tuple[Any, Score, Any]:
+    """Fits of all windows of one recording, how they predict, and with white rows ordinary fits and `Held`."""
     W, y, valid, plan = one.W, one.y, one.valid, layout.plan
     if plan is None:
-        fit = sliding_least_squares(W, y, layout.window, layout.step, valid=valid, noise=one.noise)
-        starts = window_starts(len(W), layout.window, layout.step)
-        return fit, score(W, y, valid, fit.theta, starts + layout.window, layout.window, layout.step)
-    columns, scale = _columns(plan, W, y, valid)
+        return _solved_one_by_one(layout, one)
     window = one.window if layout.window == 0 else layout.window
-    found = solve_chunk(plan, columns, scale, window * plan.outputs, one.noise, window // layout.step)
-    if found.unseen is not None:
-        vaf, samples, variance = found.unseen
-        vaf = jnp.where(samples >= 0.5 * window * plan.outputs, vaf, jnp.nan)
-        return found._replace(unseen=None), Score(vaf, jnp.full_like(vaf, jnp.nan), samples.astype(int), variance)
+    rows, ahead = window * plan.outputs, window // layout.step
+    if one.white is None:
+        found = solve_chunk(plan, *_columns(plan, W, y, valid), rows, one.noise, ahead)
+        unseen, beside = found.unseen, None
+    else:
+        found = solve_chunk(plan._replace(predicts=False), *_columns(plan, *one.white, valid), rows)
+        predicting = plan._replace(predicts=True)
+        ordinary = solve_chunk(predicting, *_columns(plan, W, y, valid), rows, None, ahead, found.theta)
+        unseen, beside = ordinary.unseen, ordinary._replace(unseen=None)
+    if plan.predicts:
+        assert unseen is not None
+        vaf = jnp.where(unseen.samples >= 0.5 * rows, unseen.vaf, jnp.nan)
+        nothing = jnp.full_like(vaf, jnp.nan)
+        return found._replace(unseen=None), Score(vaf, nothing, unseen.samples.astype(int), unseen.variance), beside
     starts = np.arange(plan.windows) * layout.step
-    return found, score(W, y, valid, found.theta, starts + layout.window, layout.window, layout.step)
+    return found, score(W, y, valid, found.theta, starts + layout.window, layout.window, layout.step), beside
+
+
+def _solved_one_by_one(layout: Layout, one: _Stack) -> tuple[Any, Score, Any]:
+    """The same without sums that windows share."""
+    W, y, valid = one.W, one.y, one.valid
+    slide = partial(sliding_least_squares, window=layout.window, step=layout.step, valid=valid)
+    fit = slide(W, y, noise=one.noise) if one.white is None else slide(*one.white)
+    starts = window_starts(len(W), layout.window, layout.step)
+    hold = partial(score, W, y, valid, fit.theta, window=layout.window, step=layout.step)
+    beside = None if one.white is None else (slide(W, y), hold(start=starts))
+    return fit, hold(start=starts + layout.window), beside
 
 
 def _columns(plan: Plan, W: AnyArray, y: AnyArray, valid: AnyArray) -> tuple[Any, Any]:
@@ -251,30 +271,58 @@ def _columns(plan: Plan, W: AnyArray, y: AnyArray, valid: AnyArray) -> tuple[Any
     return xp.pad(columns, ((0, 0), (0, behind)))[:, : plan.rows], xp.pad(scale, (0, behind))[: plan.rows]
 
 
-def _finished(rows: Rows, noise: AnyArray | None, found: Any, place: Placement, layout: Layout) -> Solved:
+def _finished(task: Task, found: Any, place: Placement, layout: Layout) -> Solved:
     """What the program found in the windows of one recording; a doubtful window is decomposed."""
+    rows, white = task.rows, task.white
     starts = window_starts(len(rows.time), place.window, place.step)
-    fit, unseen = jax.tree.map(lambda x: x[: len(starts)], found[:2])
-    doubtful = np.zeros(0, int)
-    if isinstance(fit, ChunkFit):
-        assert layout.plan is not None
-        lags = None if noise is None else np.pad(noise, (0, layout.lags - len(noise)))
-        doubtful = np.flatnonzero(fit.doubtful)
-        columns = partial(_columns, layout.plan, rows.W, rows.torque, rows.valid)
-        fit = finish(fit, Task(layout.plan, place.window * layout.plan.outputs, lags), columns)
+    fit, unseen, beside = jax.tree.map(lambda x: x[: len(starts)], found[:3])
+    noise = None if task.noise is None else np.pad(task.noise, (0, layout.lags - len(task.noise)))
+    doubtful = np.flatnonzero(fit.doubtful) if isinstance(fit, ChunkFit) else np.zeros(0, int)
+    if white is None:
+        fit = _repaired(fit, layout, place, noise, rows.W, rows.torque, rows.valid)
+        ordinary = None
+    else:
+        ordinary, seen = _apart(beside)
+        ordinary = _repaired(ordinary, layout, place, None, rows.W, rows.torque, rows.valid)
+        fit = _repaired(fit, layout, place, None, white.W, white.torque, rows.valid)
+        for k in doubtful[np.isfinite(fit.theta[doubtful]).all(axis=1)]:
+            seen.vaf[k], seen.residual_rms[k] = _predicted(rows, fit.theta[k], int(starts[k]), place.window)
+        fit = from_white(fit, ordinary, white, seen)
     complete = starts + 2 * place.window <= len(rows.time)
     vaf = np.where(complete & np.isfinite(fit.theta).all(axis=1), unseen.vaf, np.nan)
     for k in doubtful[np.isfinite(vaf[doubtful])]:
-        vaf[k] = _predicted(rows, fit.theta[k], int(starts[k]) + place.window, place.window)
-    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[2])
+        vaf[k] = _predicted(rows, fit.theta[k], int(starts[k]) + place.window, place.window)[0]
+    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[3], ordinary)
 
 
-def _predicted(rows: Rows, theta: NDArray[np.float64], start: int, window: int) -> float:
-    """Variance of the torque in a window that these parameters account for."""
+def _apart(beside: Any) -> tuple[Any, Score]:
+    """Ordinary fits, and how the others explain the windows that they were found in."""
+    if not isinstance(beside, ChunkFit):
+        return beside[0], Score(*(np.array(x) for x in jax.tree.leaves(beside[1])))
+    held = beside.seen
+    assert held is not None
+    rms = np.sqrt(np.asarray(held.mean_square))
+    return beside._replace(seen=None), Score(np.array(held.vaf), rms, np.array(held.samples, int), held.variance)
+
+
+def _repaired(
+    fit: Any, layout: Layout, place: Placement, noise: AnyArray | None, W: AnyArray, y: AnyArray, valid: AnyArray
+) -> SlidingFit:
+    """With a decomposition of the windows in doubt."""
+    if not isinstance(fit, ChunkFit):
+        return fit
+    assert layout.plan is not None
+    task = ChunkTask(layout.plan, place.window * layout.plan.outputs, noise)
+    return finish(fit, task, partial(_columns, layout.plan, W, y, valid))
+
+
+def _predicted(rows: Rows, theta: NDArray[np.float64], start: int, window: int) -> tuple[float, float]:
+    """Variance of the torque in a window that these parameters account for, and the root of the mean squared rest."""
     behind = slice(start, start + window)
-    W, y, valid = (x[behind] for x in (rows.W, rows.torque, rows.valid))
-    residual = y - W @ theta
-    return float(variance_accounted_for(y, residual, valid.astype(float)))
+    W, y, valid = (np.asarray(x[behind]) for x in (rows.W, rows.torque, rows.valid))
+    residual = np.where(valid, y - W @ theta, 0)
+    explained = float(variance_accounted_for(y, residual, valid.astype(float)))
+    return explained, float(np.sqrt((residual**2).sum() / max(valid.sum(), 1)))
 
 
 def stack_size(padded: int, count: int) -> int:

@@ -359,7 +359,7 @@ def _check_limits(trust: TrustLimits) -> None:
         if isinstance(value, float) and not (value >= 0 and math.isfinite(value)):
             raise ValueError(f"trust.{name} is {value}: it must be zero or more")
     for name in ("min_vaf", "min_valid_share"):
-        if getattr(trust, name) > 1:
+        if (getattr(trust, name) or 0) > 1:
             raise ValueError(f"trust.{name} is {getattr(trust, name)}: it is a share, between 0 and 1")
 
 

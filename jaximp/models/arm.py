@@ -275,6 +275,7 @@ def _role(name: str) -> Role:
         "stiffness": "stiffness",
         "viscous_friction": "friction",
         "coulomb_friction": "friction",
+        "offset_torque": "offset",
     }
     return Role(kinds.get(thing, "other"), tuple(map(int, index)))
 

@@ -18,7 +18,8 @@ class Role(NamedTuple):
     """What a parameter is, so that nobody must read it from a name."""
 
     kind: str
-    """`inertia`, `base_inertia` (of an arm, in Lakatos's order), `damping`, `stiffness`, `friction`, or `other`."""
+    """`inertia`, `base_inertia` (of an arm, in Lakatos's order), `damping`, `stiffness`, `friction`, `offset` (a
+    constant torque), or `other`."""
     element: tuple[int, ...] = ()
     """Which of several: the joint, or row and column of a matrix."""
 

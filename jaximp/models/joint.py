@@ -78,7 +78,8 @@ class HumanJoint(Model):
 
     @property
     def roles(self) -> tuple[Role, ...]:
-        return tuple(Role(name if name in ("inertia", "damping", "stiffness") else "other") for name in self.names)
+        kinds = {"inertia": "inertia", "damping": "damping", "stiffness": "stiffness", "offset_torque": "offset"}
+        return tuple(Role(kinds.get(name, "other")) for name in self.names)
 
     @property
     def memory(self) -> int:
@@ -183,7 +184,12 @@ class RobotJoint(Model):
 
     @property
     def roles(self) -> tuple[Role, ...]:
-        kinds = {"inertia": "inertia", "viscous_friction": "friction", "coulomb_friction": "friction"}
+        kinds = {
+            "inertia": "inertia",
+            "viscous_friction": "friction",
+            "coulomb_friction": "friction",
+            "offset_torque": "offset",
+        }
         return tuple(Role(kinds.get(name, "other")) for name in self.names)
 
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:

@@ -216,20 +216,20 @@ RULES: tuple[Rule[ArmEstimate], ...] = (
     Rule(
         "variance accounted for",
         POOR,
-        lambda e, limits: e.own is None and not e.vaf >= limits.min_vaf,
+        lambda e, limits: e.own is None and not e.vaf >= limits.usual_vaf,
         lambda e, limits: (
             f"damping and stiffness account for {_percent(e.vaf)} of the isolated torque, less than "
-            f"{_percent(limits.min_vaf)}"
+            f"{_percent(limits.usual_vaf)}"
         ),
         _always("check onsets, inertia, lengths of the arm and the handle's mass, or shorten the window"),
     ),
     Rule(
         "unseen trials are predicted",
         POOR,
-        lambda e, limits: e.own is None and not e.held_out_vaf >= limits.min_vaf,
+        lambda e, limits: e.own is None and not e.held_out_vaf >= limits.usual_vaf,
         lambda e, limits: (
             f"half of the trials predicts {_percent(e.held_out_vaf)} of the torque of the others, less than "
-            f"{_percent(limits.min_vaf)}"
+            f"{_percent(limits.usual_vaf)}"
         ),
         _always("the trials contradict each other; leave out those that went wrong, or record more"),
     ),

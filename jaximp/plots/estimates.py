@@ -240,7 +240,7 @@ def _parameter_panel(
     panel: Axes, estimates: Estimates, k: int, limits: tuple[float, float], level: float = 0.95
 ) -> None:
     """Parameter k over time: trusted windows in colour with their interval, the others pale."""
-    trusted, theta = estimates.verdicts.trusted, np.asarray(estimates.fit.theta)[:, k]
+    trusted, theta = estimates.trusted_in(estimates.names[k]), np.asarray(estimates.fit.theta)[:, k]
     low, high = (np.where(trusted, end[:, k], np.nan) for end in _interval(estimates, level))
     middle = middles(estimates)
     _shade(panel, estimates)
@@ -254,7 +254,7 @@ def _parameter_panel(
 
 def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tuple[str, str]:
     """What to write beside a parameter's panel, and in which colour."""
-    if not estimates.verdicts.trusted.any():
+    if not estimates.trusted_in(estimates.names[k]).any():
         return "none trusted" if brief else "no window can be trusted", VERMILLION
     return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
 
@@ -266,7 +266,10 @@ def _interval(estimates: Estimates, level: float = 0.95) -> tuple[Numbers, Numbe
 
 def _limits(several: Sequence[Estimates], k: int, level: float = 0.95) -> tuple[float, float]:
     """Range that shows the trusted windows of all: a wild window must not squash the others."""
-    ends = [np.stack(_interval(estimates, level), axis=-1)[estimates.verdicts.trusted, k] for estimates in several]
+    ends = [
+        np.stack(_interval(estimates, level), axis=-1)[estimates.trusted_in(estimates.names[k]), k]
+        for estimates in several
+    ]
     theta = [np.asarray(estimates.fit.theta)[:, k] for estimates in several]
     return believed(np.concatenate(ends), np.concatenate(theta))
 

@@ -120,6 +120,8 @@ class Inference(Result):
     """(p,) of least squares by noise of the position, in standard errors; draws are free of it beyond 0.25."""
     shift: Numbers
     """(p,) by which the noise that the residuals demand moves the estimate, in standard errors of the difference."""
+    constant: np.ndarray
+    """(p,) which parameters are a constant torque: slow noise hides it first, and no rule looks at it."""
     held_out: Numbers | None
     """(R, n) log predictive density of the second half of the record by its motion and the first half, row by row, NaN
     where it does not count; None where the first half alone determines nothing."""
@@ -286,8 +288,9 @@ class Inference(Result):
         and how probable that is of noise (`noise.disagreement`)."""
         from scipy.stats import norm
 
-        k = int(np.abs(self.shift).argmax())
-        size = float(np.abs(self.shift[k]))
+        judged = np.where(self.constant, 0.0, np.abs(self.shift))
+        k = int(judged.argmax())
+        size = float(judged[k])
         return self.whole.names[k], size, float(2 * norm.sf(size) * len(self.shift))
 
 
@@ -369,6 +372,7 @@ def posterior_of(
         whiteness=tuple(_whiteness(data, left[:, k], k) for k in range(left.shape[1])),
         bias=data.bias,
         shift=disagreement(data.W, data.y, data.noise, data.valid, data.difference),
+        constant=np.array([role.kind == "offset" for role in data.model.roles]),
         held_out=data.held_out(),
         prior=prior_predictive(data.prior, data.W[data.valid], data.y[data.valid]),
         time=time,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filter_settings import design_filters
+from jaximp.identification.misfit import SUSPECTS
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.job import Job
 from jaximp.least_squares.window import confidence_interval
@@ -41,7 +42,7 @@ from jaximp.reports.pages import (
     write_table,
 )
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
-from jaximp.types import Recording
+from jaximp.types import Recording, listed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -181,8 +182,9 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
         f"{windows['count']} windows of {digits(content['window_s'])} s{method}",
         sections=[
-            Section("", [*_warning(estimates_list[0], windows), *_answer(content)], void=not windows["trusted"]),
+            Section("", [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
             _verdicts(estimates_list[0], content),
+            *_tests(content),
             *figure_sections(images, TITLES, CAPTIONS, below),
             *_robot_alone(content),
             *closing_sections("Sampling, filters and limits", _settings(content), content["job"]),
@@ -192,8 +194,9 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
     )
 
 
-def _warning(estimates: Estimates, windows: dict[str, Any]) -> list[Alert]:
+def _warning(estimates: Estimates, content: dict[str, Any]) -> list[Alert]:
     """What is said before any number where few windows are trusted."""
+    windows = content["windows"]
     count, trusted = windows["count"], windows["trusted"]
     if not trusted:
         lines = [
@@ -201,12 +204,23 @@ def _warning(estimates: Estimates, windows: dict[str, Any]) -> list[Alert]:
             for verdict, of in windows["verdicts"].items()
             if of["count"]
         ]
-        return [Alert("refusal", "No window can be trusted: there is no answer to report.", lines)]
+        answered = [words(name) for name, value in content["parameters"].items() if value["mean"] is not None]
+        heading = (
+            f"Only {listed(answered)} can be trusted."
+            if answered
+            else "No window can be trusted: there is no answer to report."
+        )
+        return [Alert("refusal", heading, lines)]
     if windows["trusted_share"] < 0.5:
         share = percent(windows["trusted_share"])
         heading = f"Only {trusted} of {count} windows ({share}) can be trusted."
         return [Alert("caution", heading, ["The numbers below come from these alone."])]
     return []
+
+
+def _any_answer(content: dict[str, Any]) -> bool:
+    """Whether some parameter can be trusted in some window."""
+    return any(value["trusted_share"] for value in content["parameters"].values())
 
 
 def _answer(content: dict[str, Any]) -> list[Part]:
@@ -301,6 +315,27 @@ def _robot_alone(content: dict[str, Any]) -> list[Section]:
     return [Section("Robot alone", [Table(columns, rows)])]
 
 
+def _tests(content: dict[str, Any]) -> list[Section]:
+    """What the model was asked for, and what it would change."""
+    if not content["tests"]:
+        return []
+    weights = [name for reflex in content["reflex"].values() for name in reflex["weights"]["names"]]
+    names = [name for name in content["tests"][0]["move"] if name not in weights]
+    columns = [Column("Is this missing?", "text"), Column("p"), *(Column(f"moves {words(name)} by") for name in names)]
+    rows = []
+    for one in content["tests"]:
+        joint, _, group = one["group"].rpartition(": ")
+        what = SUSPECTS[group].what
+        moves = [f"{number(one['move'][name], 2)} ± {number(one['move_stderr'][name], 1)}" for name in names]
+        rows.append([f"{joint}: {what}" if joint else what, number(one["p"], 2), *moves])
+    said = "; ".join(content["lacking"].values()) or "Nothing that moves a parameter beyond error and 5 % was found."
+    told = (
+        "Each row adds columns to the model, over all windows at once, in rows whose noise is white. p is the "
+        "probability that so much would be found where nothing is missing; of all rows together 1 % is allowed."
+    )
+    return [Section("Tests of the model", [Prose(said), Table(columns, rows, remark=told)])]
+
+
 def _all_methods(content: dict[str, Any]) -> list[dict[str, Any]]:
     return [content, *content["further_methods"]]
 
@@ -375,6 +410,17 @@ def _result(estimates: Estimates) -> dict[str, Any]:
         "mean_held_out_vaf": _mean(estimates.held_out_vaf[trusted]),
         "mean_vaf_of_all_windows": _mean(vaf),
         "threshold": estimates.threshold,
+        "tests": [
+            {
+                "group": one.group,
+                "p": one.p,
+                "chi_squared": one.statistic,
+                "move": dict(zip(estimates.names, map(float, one.move), strict=False)),
+                "move_stderr": dict(zip(estimates.names, map(float, one.stderr), strict=False)),
+            }
+            for one in estimates.misfits
+        ],
+        "lacking": dict(estimates.lacking),
         "notes": list(estimates.notes),
     }
 
@@ -395,19 +441,20 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
     """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
     factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
     estimates = estimates.summarised()
-    fit, trusted = estimates.fit, estimates.verdicts.trusted
+    fit, found = estimates.fit, {}
     theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
     low, high = confidence_interval(theta, stderr, fit.dof)
-    return {
-        name: {
+    for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True)):
+        trusted = estimates.trusted_in(name)
+        found[name] = {
             "unit": unit,
+            "trusted_share": float(trusted.mean()),
             "mean": _mean(theta[trusted, k]),
             "sd": _spread(theta[trusted, k]),
             "median_stderr": _median(stderr[trusted, k]),
             "half_width_95": _median((high - low)[trusted, k] / 2),
         }
-        for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True))
-    }
+    return found
 
 
 def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | None = None) -> dict[str, Any]:
@@ -420,6 +467,7 @@ def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | 
         "delay": {"unit": "s", "median": _median(delay[np.isfinite(delay)]), "sd": _spread(delay[np.isfinite(delay)])},
         "lags_s": reflex.lags.tolist(),
         "weights": {
+            "names": [estimates.names[k] for k in reflex.columns],
             "unit": reflex.unit,
             "mean": [_mean(column) for column in theta[trusted].T],
             "sd": [_spread(column) for column in theta[trusted].T],
@@ -479,6 +527,8 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
     def cutoff(kind: str, order: str) -> str:
         return "none" if filters[kind] is None else f"{filters[kind]:g} Hz, Butterworth of order {filters[order]}"
 
+    vaf, tested = limits["min_vaf"], content["tests"]
+    needed = "a model that lacks nothing" if tested and vaf is None else f"a VAF of {0.75 if vaf is None else vaf:g}"
     threshold, step = content["threshold"], content["step_s"]
     speed = "m/s" if set(recording["joints"]) == {"prismatic"} else "rad/s"
     return {
@@ -494,7 +544,7 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "window": f"{content['window_s']:g} s" + ("" if step is None else f", one every {step:.3g} s"),
         "slowest motion that counts": f"{content['min_velocity']:g} {speed}" if content["min_velocity"] else "any",
         "threshold on the condition number": "none" if threshold is None else f"{threshold:.4g}",
-        "to be trusted, a window needs": f"a VAF of {limits['min_vaf']:g}, standard errors below "
+        "to be trusted, a window needs": f"{needed}, standard errors below "
         f"{percent(limits['max_relative_stderr'])}, columns {limits['min_excitation_ratio']:g} times above position "
         f"noise, {percent(limits['min_valid_share'])} of its samples",
     }

@@ -212,7 +212,7 @@ def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
             "handle_damping_Ns_per_m": None if handle is None else np.asarray(handle.damping, float).tolist(),
             "inertia_from": "given" if result.static is None else "the static task",
         },
-        "trust_limits": asdict(job.trust),
+        "trust_limits": asdict(job.trust) | {"min_vaf": job.trust.usual_vaf},
         "versions": versions(),
         "job": job.text,
     }

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+
+DIFFERENCES, FEWEST_DIFFERENCES = (4, 6, 8, 12), 20
+"""Orders of differences in which noise is looked for, and how many times as many samples there must be."""
 
 
 def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -71,17 +75,23 @@ def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool
 
 
 def noise_level(x: NDArray[np.float64]) -> float:
-    """Standard deviation of the white noise in a smooth, finely sampled signal (N,), from its fourth differences.
+    """Standard deviation of the white noise in a smooth signal (N,), from its fourth to twelfth differences.
 
-    A motion that is slow against the sample rate vanishes in them. The median keeps jumps from counting. A coarse
-    encoder leaves at least the noise of its rounding, step/sqrt(12).
+    A motion vanishes in them, a fast one in the higher ones alone: the smallest estimate counts. The median keeps
+    jumps from counting. A coarse encoder leaves at least the noise of its rounding, step/sqrt(12).
     """
-    fourth = np.diff(x, 4)
-    fourth = fourth[np.isfinite(fourth)]
-    if not len(fourth):
+    levels = [_level_of_differences(x, order) for order in DIFFERENCES if len(x) > FEWEST_DIFFERENCES * order]
+    known = [level for level in levels or [_level_of_differences(x, 4)] if np.isfinite(level)]
+    if not known:
         return 0.0
-    robust = 1.4826 * np.median(np.abs(fourth)) / np.sqrt(70.0)
-    return float(max(robust, quantisation_step(x) / np.sqrt(12.0)))
+    return float(max(min(known), quantisation_step(x) / np.sqrt(12.0)))
+
+
+def _level_of_differences(x: NDArray[np.float64], order: int) -> float:
+    """Standard deviation of white noise with differences as large as these; NaN where there are none."""
+    found = np.diff(x, order)
+    found = found[np.isfinite(found)]
+    return 1.4826 * float(np.median(np.abs(found))) / np.sqrt(comb(2 * order, order)) if len(found) else np.nan
 
 
 def quantisation_step(x: NDArray[np.float64]) -> float:

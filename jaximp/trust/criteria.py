@@ -185,8 +185,8 @@ class Confidence:
             "damping quasi-symmetric": self.damping.quasi_symmetric(self.limits),
             "standard errors": (self.relative_stderr <= self.limits.max_relative_stderr)
             & (self.dof >= self.limits.min_dof),
-            "explained torque": self.vaf >= self.limits.min_vaf,
-            "held-out torque": self.held_out_vaf >= self.limits.min_vaf,
+            "explained torque": self.vaf >= self.limits.usual_vaf,
+            "held-out torque": self.held_out_vaf >= self.limits.usual_vaf,
         }
 
     @property

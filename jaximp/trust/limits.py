@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class TrustLimits:
     """What a window must keep to be trusted."""
 
-    min_vaf: float = 0.75
-    """Share of the torque's variance that the model must explain."""
+    min_vaf: float | None = None
+    """Share of the torque's variance that the model must explain. By default 0.75, and any where the model is tested
+    for what it lacks: noise lowers the share and leaves estimates right, and a wrong model may explain most of it."""
     max_residual_ratio: float = 4.0
     """Largest residual and largest unexplained share of the torque's variance, as multiples of their lower quartiles
     over the excited windows: where both are above, something happened that the model does not know, such as a parameter
@@ -35,4 +36,10 @@ class TrustLimits:
     max_condition: float | None = None
     """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
     parameters: tuple[str, ...] = ()
-    """The parameters that matter: only their standard errors and excitation are judged. Empty for all of them."""
+    """The parameters that matter: only their standard errors and excitation are judged. Empty for all but a constant
+    torque."""
+
+    @property
+    def usual_vaf(self) -> float:
+        """`min_vaf`, or what it is by default."""
+        return 0.75 if self.min_vaf is None else self.min_vaf

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.least_squares.window import SlidingFit
-from jaximp.models.base import Role
+from jaximp.models.base import Model, Role
 from jaximp.trust.criteria import USUAL, MatrixCriteria, body_margin, matrix_criteria
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, WEAK, Rule, Verdicts, judge_all
@@ -21,6 +21,12 @@ from jaximp.types import Numbers, nearest
 
 POSITIVE_INERTIA = "an inertia above zero"
 """The rule that a wrong sign of the torque breaks."""
+NOTHING_MISSING = "a model that lacks nothing"
+"""The rule that a test of the model breaks, for all windows of a record."""
+TOGETHER = 3.0
+"""Standard errors by which all windows together may find a negative inertia."""
+FEWEST_TOGETHER = 3
+"""Windows that are judged together."""
 MASSES = (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,)))
 """What cannot be below zero."""
 
@@ -68,6 +74,16 @@ class Windows:
     stiffness: MatrixCriteria | None
     """Of an arm."""
     damping: MatrixCriteria | None
+    worse_than_nothing: bool = False
+    """Whether most windows predict the torque of the next one worse than a constant would."""
+    mass_below_zero: float = -np.inf
+    """How far the mean inertia of windows side by side is below zero, in standard errors."""
+    tested: bool = False
+    """Whether the model of the whole record was tested for what it lacks."""
+    missing: str = ""
+    """What the model of the whole record lacks, and what that does to the parameters; empty where nothing is known."""
+    remedy: str = ""
+    """Against that."""
 
     def one(self, k: int) -> Windows:
         """What is measured of one window."""
@@ -114,7 +130,7 @@ def measure_windows(
         built_by_noise = np.sqrt(samples) * column_noise[:, None]
         ratio = np.where(built_by_noise > 0, excitation / built_by_noise, np.inf)
         below_zero = -theta / stderr
-    judged = _judged(names, limits.parameters)[:, None]
+    judged = _judged(names, roles, limits.parameters)[:, None]
     error, ratio = np.where(judged, error, 0.0), np.where(judged, ratio, np.inf)
     mass = np.array([role in MASSES for role in roles])
     friction = np.array([role.kind == "friction" for role in roles])
@@ -157,12 +173,37 @@ def judge_windows(windows: Windows, limits: TrustLimits = USUAL) -> Verdicts:
     return judge_all(RULES, usual, limits)
 
 
-def _judged(names: Sequence[str], chosen: Sequence[str]) -> NDArray[np.bool_]:
-    """Which parameters the verdict looks at."""
+def judge_together(windows: Windows, fit: SlidingFit, roles: Sequence[Role], held_out: Numbers, apart: int) -> Windows:
+    """With what only many windows can tell.
+
+    **Arguments:** `held_out` (M,) how each window predicts the next; windows `apart` of each other share no rows.
+    """
+    known = held_out[np.isfinite(held_out)]
+    worse = len(known) >= FEWEST_TOGETHER and float(np.median(known)) < 0
+    below = -np.inf
+    for k, role in enumerate(roles):
+        theta, stderr = (np.asarray(x)[::apart, k] for x in (fit.theta, fit.stderr))
+        counts = np.isfinite(theta) & (stderr > 0)
+        if role in MASSES and counts.sum() >= FEWEST_TOGETHER:
+            weight = 1 / stderr[counts] ** 2
+            below = max(below, float(-(weight * theta[counts]).sum() / np.sqrt(weight.sum())))
+    return replace(windows, worse_than_nothing=worse, mass_below_zero=below)
+
+
+def judged_names(model: Model, limits: TrustLimits = USUAL) -> list[str]:
+    """The parameters that the verdict looks at."""
+    judged = _judged(model.names, model.roles, limits.parameters)
+    return [name for name, looked_at in zip(model.names, judged, strict=True) if looked_at]
+
+
+def _judged(names: Sequence[str], roles: Sequence[Role], chosen: Sequence[str]) -> NDArray[np.bool_]:
+    """Which parameters the verdict looks at: the chosen, or all but a constant torque, which slow noise hides first."""
     for name in chosen:
         if name not in names:
             raise ValueError(f"trust.parameters has an unknown parameter '{name}': {nearest(name, list(names))}")
-    return np.array([not chosen or name in chosen for name in names])
+    return np.array(
+        [name in chosen if chosen else role.kind != "offset" for name, role in zip(names, roles, strict=True)]
+    )
 
 
 def _element(role: Role) -> str:
@@ -193,6 +234,11 @@ def _indefinite(which: str) -> Rule[Windows]:
         return f"the {which} is not positive definite: its smallest eigenvalue is {matrix.eigenvalues[0]:.3g}"
 
     return Rule(f"a {which} that is positive definite", POOR, broken, reason)
+
+
+def _least_vaf(w: Windows, limits: TrustLimits) -> float:
+    """Tests of the model say more than the share of the variance, which noise lowers too."""
+    return -np.inf if w.tested and limits.min_vaf is None else limits.usual_vaf
 
 
 def _asymmetric(w: Windows, limits: TrustLimits) -> Any:
@@ -258,7 +304,7 @@ RULES: tuple[Rule[Windows], ...] = (
     Rule(
         "variance accounted for",
         POOR,
-        lambda w, limits: ~(w.vaf >= limits.min_vaf),
+        lambda w, limits: ~(w.vaf >= _least_vaf(w, limits)),
         lambda w, limits: f"the model explains {w.vaf:.0%} of the torque's variance",
     ),
     Rule(
@@ -295,5 +341,29 @@ RULES: tuple[Rule[Windows], ...] = (
     _indefinite("damping"),
     _indefinite("stiffness"),
     Rule("a stiffness that is symmetric", POOR, _asymmetric, _asymmetry),
+    Rule(
+        "an inertia above zero in windows together",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), w.mass_below_zero > TOGETHER),
+        lambda w, limits: (
+            f"the inertia of all windows together is negative, as no mass can be, by {w.mass_below_zero:.2g} standard "
+            "errors"
+        ),
+        lambda w, limits: "does the torque need sign = -1, or does the model lack something?",
+    ),
+    Rule(
+        "predictions better than nothing",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), w.worse_than_nothing),
+        lambda w, limits: "most windows predict the torque of the next one worse than a constant does",
+        lambda w, limits: "is the torque that of this joint, and the model the right one?",
+    ),
+    Rule(
+        NOTHING_MISSING,
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), bool(w.missing)),
+        lambda w, limits: w.missing,
+        lambda w, limits: w.remedy,
+    ),
 )
-"""From what leaves nothing to judge to what makes an estimate doubtful."""
+"""From what leaves nothing to judge to what makes an estimate doubtful; the last spares some parameters."""

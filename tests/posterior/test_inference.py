@@ -210,7 +210,9 @@ def test_a_gain_with_few_draws_is_not_believed(found: Inference) -> None:
     assert whole.ok
     windows = stacked([slow_sum(k) for k in range(1, n + 1)])
     assert windows.ok.all()
-    by_weight = replace(found, whole=whole, windows=windows, bias=np.zeros(2), shift=np.zeros(2))
+    by_weight = replace(
+        found, whole=whole, windows=windows, bias=np.zeros(2), shift=np.zeros(2), constant=np.zeros(2, bool)
+    )
     assert by_weight.why == ""
     assert by_weight.good.any()
     by_gain = replace(by_weight, gains={"reflex_gain": np.ones(2)})

@@ -102,15 +102,17 @@ def test_a_moving_arm_is_believed(torque_noise: float, seed: int, decimate: int 
 
 
 @noises
-@seeds
 @decimations
-def test_what_is_believed_in_motion_is_right(torque_noise: float, seed: int, decimate: int | None) -> None:
+def test_what_is_believed_in_motion_is_right(torque_noise: float, decimate: int | None) -> None:
     # The position's filter of order 2 takes 1 % off the fastest line, and the torque does not pass it: that shows
-    # where the noise is small. Order 8 takes nothing.
-    estimates = identified(MULTISINE, True, torque_noise, seed, decimate, order=8)
-    trusted = estimates.verdicts.trusted & inside(estimates)[1]
-    assert trusted.sum() > 200
-    assert beyond_four_errors(estimates)[trusted].mean() <= 0.01
+    # where the noise is small. Order 8 takes nothing. Windows overlap: one record has eight that share no sample.
+    wrong = []
+    for seed in range(8):
+        estimates = identified(MULTISINE, True, torque_noise, seed, decimate, order=8)
+        trusted = estimates.verdicts.trusted & inside(estimates)[1]
+        assert trusted.sum() > 200
+        wrong += beyond_four_errors(estimates)[trusted].tolist()
+    assert np.mean(wrong) <= 0.01
 
 
 @decimations

@@ -1,0 +1,197 @@
+"""Rows whose noise is white: generalised least squares, by an autoregression of what windows leave of the torque.
+
+The estimates come from white rows; how well they explain the torque is asked of the rows as they were filtered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.regression import Rows
+from jaximp.least_squares.autoregression import Autoregression, autoregression_of, fit_window_noise, whiten_rows
+from jaximp.least_squares.sliding import Score
+from jaximp.least_squares.window import SlidingFit, WindowFit
+from jaximp.types import AnyArray, Numbers
+
+BEYOND = 1.1
+"""Rows whose half rate is about so many times the cut-off of the low-pass each say something new."""
+FEWEST_ROWS = 200
+"""Independent rows of all windows from which a scatter of their scores is judged."""
+
+
+@dataclass(frozen=True)
+class White:
+    """Rows of a recording whose noise is white."""
+
+    W: AnyArray
+    """(N, *n, p)"""
+    torque: AnyArray
+    """(N, *n), in units of each output's own noise where there are several."""
+    noisy: AnyArray | None
+    """(N, *n, p) what noise of the position leaves in every column."""
+    filtered: Autoregression
+    """What the filters make of white noise."""
+    noise: tuple[Autoregression, ...]
+    """Of each output, what is left where that is taken off."""
+    size: Numbers
+    """(n,) by what each output was divided."""
+    inflation: Numbers
+    """(p,) by what standard errors grow since the noise's size follows the motion; one where it does not."""
+
+    @property
+    def every(self) -> int:
+        """So many neighbouring rows say as much as one."""
+        return self.filtered.every
+
+    @property
+    def column_noise(self) -> Numbers:
+        """(p,) root mean square of what noise of the position leaves in every column."""
+        assert self.noisy is not None
+        return np.sqrt((self.noisy.reshape(-1, self.noisy.shape[-1]) ** 2).mean(axis=0))
+
+    def apply(self, columns: AnyArray, valid: AnyArray) -> NDArray[np.float64]:
+        """Further columns (N, *k) through the same filter, of the last output."""
+        before = whiten_rows(columns, valid, self.filtered)
+        return np.asarray(whiten_rows(before, valid, self.noise[-1])) / self.size[-1]
+
+
+def rows_apart(pipeline: Pipeline) -> int:
+    """How many rows behind each other say something new: after a low-pass not all of them do."""
+    cutoff = pipeline.filter.decimation_cutoff
+    if cutoff is None:
+        return 1
+    return max(1, round(pipeline.sample_rate / pipeline.filters.decimate / (2 * BEYOND * cutoff)))
+
+
+def whiten(pipeline: Pipeline, rows: Rows) -> White:
+    """White rows, by the noise of each output."""
+    every, window = rows_apart(pipeline), pipeline.window_rows
+    W, y, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
+    outputs = 1 if y.ndim == 1 else y.shape[1]
+    W, y, valid = W.reshape(len(W), outputs, -1), y.reshape(-1, outputs), valid.reshape(-1, outputs)
+    known = pipeline.filters.noise
+    filtered = Autoregression(every=every) if known is None else autoregression_of(known, every)
+
+    def white(z: AnyArray, noise: Sequence[Autoregression]) -> NDArray[np.float64]:
+        return np.stack([whiten_rows(z[:, j], valid[:, j], noise[j]) for j in range(outputs)], axis=1)
+
+    columns = [W, y, *([] if rows.noisy is None else [rows.noisy.reshape(W.shape)])]
+    W, y, *noisy = (white(z, [filtered] * outputs) for z in columns)
+    noise = tuple(fit_window_noise(W[:, j], y[:, j], valid[:, j], window, every) for j in range(outputs))
+    W, y, *noisy = (white(z, noise) for z in (W, y, *noisy))
+    size = _sizes(W, y, valid, window)
+    W, y = W / size[:, None], y / size
+    shape = rows.torque.shape
+    inflation = _inflation(W.reshape(-1, W.shape[-1]), y.ravel(), valid.ravel(), window * outputs, every)
+    return White(
+        W=W.reshape(*shape, -1),
+        torque=y.reshape(shape),
+        noisy=(noisy[0] / size[:, None]).reshape(*shape, -1) if noisy else None,
+        filtered=filtered,
+        noise=noise,
+        size=size,
+        inflation=inflation,
+    )
+
+
+def _sizes(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int) -> Numbers:
+    """(n,) of the noise in each output, relative to the first: several outputs with common parameters are weighed."""
+    outputs = y.shape[1]
+    if outputs == 1:
+        return np.ones(1)
+    left = np.array([
+        sum(_left(W[part, j], y[part, j], valid[part, j]) for part in _parts(len(y), window))
+        for j in range(outputs)
+    ])  # fmt: skip
+    size = np.sqrt(left / np.maximum(valid.sum(axis=0), 1))
+    return np.where(size > 0, size, 1) / (size[0] if size[0] > 0 else 1)
+
+
+def _parts(n: int, window: int) -> list[slice]:
+    """Windows side by side."""
+    return [slice(first, first + window) for first in range(0, n - window + 1, window)]
+
+
+def _left(W: Numbers, y: Numbers, valid: NDArray[np.bool_]) -> float:
+    """Sum of squares that ordinary least squares leaves."""
+    theta = np.linalg.lstsq(W[valid], y[valid])[0]
+    return float(((y - W @ theta)[valid] ** 2).sum())
+
+
+def _inflation(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int, every: int) -> Numbers:
+    """(p,) root of the variance that the scatter of scores gives over the textbook's, of windows side by side.
+
+    **Source:** White 1980; residuals scaled by their leverage, MacKinnon and White 1985 (HC2).
+    """
+    p, ratios, weights = W.shape[1], [], []
+    for part in _parts(len(y), window):
+        rows, torque = W[part][valid[part]], y[part][valid[part]]
+        if len(rows) < (p + 2) * every:
+            continue
+        Q, R = np.linalg.qr(rows)
+        diagonal = np.abs(np.diagonal(R))
+        if diagonal.min() <= 1e-10 * diagonal.max():
+            continue
+        residual = torque - Q @ (Q.T @ torque)
+        freedom = len(rows) - p
+        if not residual @ residual > 0:
+            continue
+        scores = Q * (residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), 1e-3)))[:, None]
+        inverse = np.linalg.inv(R)
+        robust = ((scores @ inverse.T) ** 2).sum(axis=0)
+        plain = (inverse**2).sum(axis=1) * (residual @ residual) / freedom
+        ratios.append(robust / plain)
+        weights.append(freedom / every)
+    if sum(weights) < FEWEST_ROWS:
+        return np.ones(p)
+    return np.sqrt(np.average(ratios, axis=0, weights=weights))
+
+
+def from_white(fit: SlidingFit, ordinary: SlidingFit, white: White, seen: Score | None = None) -> SlidingFit:
+    """Estimates and errors of white rows; condition, and what the torque says of them, of the rows as they were
+    filtered.
+
+    **Arguments:** `fit` of the white rows with the textbook's errors; `ordinary` of the others; `seen`, how the
+    estimates explain the torque of their windows (without it that of the ordinary ones stands there).
+    """
+    stderr, dof = _with_sizes(fit.stderr, fit.dof, fit.samples, white)
+    solved = np.isfinite(np.asarray(fit.theta)).all(axis=1)
+    vaf, rms = (ordinary.vaf, ordinary.residual_rms) if seen is None else (seen.vaf, seen.residual_rms)
+    dof, cond, sigma_min, vaf, rms = (
+        np.where(solved, np.asarray(x), np.nan) for x in (dof, ordinary.cond, ordinary.sigma_min, vaf, rms)
+    )
+    return SlidingFit(
+        theta=fit.theta, stderr=stderr, dof=dof, cond=cond, sigma_min=sigma_min, excitation=fit.excitation,
+        residual_rms=rms, vaf=vaf, samples=fit.samples, first=fit.first, last=fit.last,
+    )  # fmt: skip
+
+
+def with_sizes_of_one(fit: WindowFit, white: White) -> WindowFit:
+    """The fit of one window of white rows, with the errors of white rows."""
+    stderr, dof = _with_sizes(fit.stderr[None], fit.dof[None], fit.samples[None], white)
+    grown = stderr[0] / np.asarray(fit.stderr)
+    covariance = np.asarray(fit.covariance) * np.outer(grown, grown)
+    return eqx.tree_at(
+        lambda f: (f.stderr, f.dof, f.covariance),
+        fit,
+        (jnp.asarray(stderr[0]), jnp.asarray(dof[0]), jnp.asarray(covariance)),
+    )
+
+
+def _with_sizes(stderr: AnyArray, dof: AnyArray, samples: AnyArray, white: White) -> tuple[Numbers, Numbers]:
+    """Standard errors (M, p) and degrees of freedom (M,) of white rows, from the textbook's.
+
+    Of rows that repeat each other so many times, the squares of the residuals sum up as often, and say no more.
+    """
+    p, every = stderr.shape[1], white.every
+    freedom = np.asarray(samples) - every * p
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(freedom > 0, np.sqrt(every * np.asarray(dof) / freedom), np.nan)
+    return np.asarray(stderr) * factor[:, None] * white.inflation, np.maximum(freedom / every, 0)
