@@ -16,7 +16,7 @@ from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
-from jaximp.trust.score_tests import Misfit
+from jaximp.trust.score_tests import Bands, Misfit
 from jaximp.trust.verdicts import Verdicts, worst
 from jaximp.trust.window_rules import NOTHING_MISSING, Windows, judge_windows
 
@@ -105,6 +105,10 @@ class Estimates(Result):
     """What a reader must know of these numbers, in plain words."""
     misfits: tuple[Misfit, ...] = ()
     """Tests of the model over the whole record, where its noise was estimated."""
+    noise: tuple[NDArray[np.float64], ...] = ()
+    """Of each joint (or, for an arm, in one array) frequency [Hz] and density of the noise that was estimated."""
+    bands: Bands | None = None
+    """Ordinary least squares beside the estimates, where these are others."""
     lacking: Mapping[str, str] = field(default_factory=dict)
     """Parameters that what the model lacks moves beyond error and a share that matters, and why, in words."""
     reflexes: tuple[Reflex, ...] = ()
@@ -235,6 +239,20 @@ class Estimates(Result):
     def sd_over_trusted(self) -> NDArray[np.float64]:
         """(p,) standard deviation of each parameter over the same windows; NaN if there are none."""
         return np.array([column.std() if len(column) else np.nan for column in self._trusted_columns()])
+
+    def undetermined(self) -> dict[str, float]:
+        """Parameters whose standard error in one window is, in the median over those that can be trusted in it, a
+        larger share of their mean than `limits.max_relative_stderr`; and that share.
+
+        The rules of a window are milder: they compare with what would explain the whole torque by itself.
+        """
+        found = {}
+        for k, (name, mean) in enumerate(zip(self.names, self.mean_over_trusted(), strict=True)):
+            errors = self.stderr[self.trusted_in(name), k]
+            share = float(np.median(errors) / abs(mean)) if len(errors) and mean else 0.0
+            if share > self.limits.max_relative_stderr:
+                found[name] = share
+        return found
 
     def _trusted_columns(self) -> list[NDArray[np.float64]]:
         return [self.value[self.trusted_in(name), k] for k, name in enumerate(self.names)]

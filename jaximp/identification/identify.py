@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
-from jaximp.identification.misfit import find_misfits, harmless, in_words, missing, off_by, unnoticed
+from jaximp.identification.misfit import by_bands, find_misfits, harmless, in_words, missing, off_by, unnoticed
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import METHODS, Regression, Separation, Whiten, fit_robot, separate
@@ -37,7 +37,7 @@ from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.criteria import fake_change_threshold
-from jaximp.trust.score_tests import Misfit
+from jaximp.trust.score_tests import Misfit, compare_bands
 from jaximp.trust.window_rules import judge_together, judged_names, measure_windows
 from jaximp.types import Progress, Recording, nearest
 
@@ -352,6 +352,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         names=model.names,
         units=model.units,
         fit=fit,
+        noise=tuple(one for part in parts for one in part.noise),
         misfits=tuple(
             replace(one, group=f"joint {j + 1}: {one.group}") for j, part in enumerate(parts) for one in part.misfits
         ),
@@ -490,16 +491,26 @@ def _estimates(
     measured = measure_windows(
         fit, model.names, model.roles, full, whole.parameter_scale, prepared.column_noise, threshold, limits
     )
+    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
+    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
     size = np.abs(np.nanmedian(np.asarray(fit.theta), axis=0)) if misfits else np.zeros(0)
     of_model = (misfits, model.names, size)
     off, judged = off_by(*of_model), judged_names(model, limits)
     why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
-    measured = replace(measured, tested=bool(misfits), missing=why, remedy=remedy)
     apart = -(-place.window // place.step) if not place.separate else max(1, int(place.next_starts[0] // place.window))
+    bands = None
+    if solved.ordinary is not None and misfits:
+        bands = compare_bands(*(np.asarray(x.theta)[::apart] for x in (solved.ordinary, fit)))
+    noise: tuple[NDArray[np.float64], ...] = ()
+    if prepared.white and curves:
+        row_rate = pipeline.sample_rate / pipeline.filters.decimate
+        noise = (prepared.white[0].noise_spectrum(row_rate, torque.reshape(reconstructed.shape) - reconstructed),)
+    differing = by_bands(bands, model.names, model.units)
+    others = [text for name, text in differing.items() if name in judged and name not in off]
+    why = "; ".join(filter(None, [why, *others]))
+    measured = replace(measured, tested=bool(misfits), missing=why, remedy=remedy)
     measured = judge_together(measured, fit, model.roles, np.asarray(held_out), apart)
     jumps = jump_note(recording, prepared.jumps)
-    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
-    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -522,7 +533,10 @@ def _estimates(
         ),
         reflexes=reflexes,
         misfits=misfits,
-        lacking={name: in_words(misfits, {name: share}) for name, share in off.items() if name not in weights},
+        bands=bands,
+        noise=noise,
+        lacking=differing
+        | {name: in_words(misfits, {name: share}) for name, share in off.items() if name not in weights},
     )
     about = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
     return replace(estimates, notes=estimates.notes + about) if about else estimates

@@ -13,7 +13,7 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import measured_motion
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
-from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Misfit, score_groups, significant
+from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording
 
 REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.03, 0.1, 0.3)
@@ -186,6 +186,18 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     """Why these parameters cannot be trusted; empty where none is off."""
     changes = ", ".join(f"{name} would change by {share:+.0%}" for name, share in off.items())
     return f"the model lacks {culprits(misfits)}: {changes}" if off else ""
+
+
+def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
+    """Parameters that depend on the frequencies that least squares weighs, and how, in words."""
+    if bands is None:
+        return {}
+    return {
+        name: f"{name} depends on the frequency (ordinary least squares, which counts slow motion more, finds "
+        f"{bands.ordinary[k]:.3g} and not {bands.generalised[k]:.3g} {unit})"
+        for k, (name, unit) in enumerate(zip(names, units, strict=True))
+        if bands.apart(k)
+    }
 
 
 def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, str]:

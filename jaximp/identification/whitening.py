@@ -22,6 +22,8 @@ from jaximp.types import AnyArray, Numbers
 
 BEYOND = 1.1
 """Rows whose half rate is about so many times the cut-off of the low-pass each say something new."""
+FREQUENCIES = 256
+"""Of a spectrum that is shown."""
 FEWEST_ROWS = 200
 """Independent rows of all windows from which a scatter of their scores is judged."""
 
@@ -55,6 +57,20 @@ class White:
         """(p,) root mean square of what noise of the position leaves in every column."""
         assert self.noisy is not None
         return np.sqrt((self.noisy.reshape(-1, self.noisy.shape[-1]) ** 2).mean(axis=0))
+
+    def noise_spectrum(self, row_rate: float, left: AnyArray) -> Numbers:
+        """(1 + n, FREQUENCIES) frequency [Hz] and, of each output, one-sided density of the noise as it was filtered.
+
+        **Arguments:** `row_rate` of the rows [Hz]; `left` (N, *n) of the torque by the estimates, NaN where it does not
+        count, which has the size of the noise.
+        """
+        frequency = np.linspace(0, row_rate / self.every / 2, FREQUENCIES)
+        variance = np.nanmean(np.reshape(left, (len(left), -1)) ** 2, axis=0)
+        of_filters, found = self.filtered.spectrum(frequency, row_rate), [frequency]
+        for noise, size in zip(self.noise, variance, strict=True):
+            shape = of_filters * noise.spectrum(frequency, row_rate)
+            found.append(shape * size / (shape.sum() * frequency[1]))
+        return np.stack(found)
 
     def apply(self, columns: AnyArray, valid: AnyArray) -> NDArray[np.float64]:
         """Further columns (N, *k) through the same filter, of the last output."""

@@ -20,6 +20,7 @@ from jaximp.plots.style import (
     BLUE,
     HATCH,
     LINES,
+    ORANGE,
     PALE,
     STYLE,
     VERMILLION,
@@ -441,6 +442,10 @@ def _spectra(panel: Axes, estimates: Estimates, joint: int) -> None:
     spectra = [welch(signal, rate, nperseg=max(16, n // 8)) for signal in signals]
     for (frequency, power), (color, style, label) in zip(spectra, lines, strict=False):
         panel.loglog(frequency[1:], power[1:], color=color, linestyle=style, label=label)
+    noise = [(one[0], density) for one in estimates.noise for density in one[1:]]
+    if noise:
+        frequency, density = (x[1:] for x in noise[joint])
+        panel.loglog(frequency, density, color=ORANGE, linewidth=1.6, label="noise, estimated")
     frequency, power = (x[1:] for x in spectra[0])
     shown = frequency[power > 1e-6 * power.max()]  # what the filters removed is not worth the ink
     panel.set(ylim=(power.max() * 1e-6, power.max() * 3), xlim=(frequency[0], max(shown[-1], 2 * frequency[0])))

@@ -74,7 +74,7 @@ CAPTIONS = {
     "condition": "A large condition number or a small singular value means that the motion does not tell the "
     "parameters apart. Where the held-out VAF falls below the other, the parameters change or fit noise.",
     "residual_spectrum": "What the model leaves over, by frequency. A peak that the torque has as well is something "
-    "that the model lacks; a flat floor is noise.",
+    "that the model lacks. The estimated noise is what tells how far each frequency can be relied on.",
     "reflex": "What a stretch does to the torque as time goes by: the weight of every lag of the rectified velocity. "
     "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
     "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "
@@ -242,7 +242,9 @@ def _parameter_table(found: dict[str, Any]) -> Table:
         half, mean = value["half_width_95"], value["mean"]
         interval = "–"
         if half is not None:
-            interval = f"± {number(half, 2)}" + (", holds zero" if mean is not None and abs(mean) < half else "")
+            zero = mean is not None and abs(mean) < half
+            loose = "" if value["determined"] else ", not determined"
+            interval = f"± {number(half, 2)}" + (", holds zero" if zero else loose)
         rows.append([words(name), digits(mean), interval, digits(value["sd"], 2), pretty_unit(value["unit"])])
     medians = {f"{words(name)} (median)": value for name, value in found["equilibrium"].items()}
     medians |= {f"{words(name)} mean delay (median)": value["delay"] for name, value in found["reflex"].items()}
@@ -441,7 +443,7 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
     """Every parameter over the trusted windows, times a factor; of a reflex its gain."""
     factor = np.append(factor[estimates.intrinsic], [factor[reflex.columns[0]] for reflex in estimates.reflexes])
     estimates = estimates.summarised()
-    fit, found = estimates.fit, {}
+    fit, found, loose = estimates.fit, {}, estimates.undetermined()
     theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
     low, high = confidence_interval(theta, stderr, fit.dof)
     for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True)):
@@ -449,6 +451,7 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
         found[name] = {
             "unit": unit,
             "trusted_share": float(trusted.mean()),
+            "determined": name not in loose,
             "mean": _mean(theta[trusted, k]),
             "sd": _spread(theta[trusted, k]),
             "median_stderr": _median(stderr[trusted, k]),

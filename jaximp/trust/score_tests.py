@@ -21,6 +21,8 @@ ERRORS, SHARE = 2.0, 0.05
 """A parameter is off where it would move by so many errors of the move, and by such a share of itself."""
 ALIKE = 0.85
 """A group that explains such a share of what the best one does looks like it."""
+FEWEST_COMPARED = 6
+"""Windows side by side whose estimates by ordinary and by generalised least squares are compared."""
 STILL = 0.1
 """A window whose columns are excited by a smaller share of what is usual has no say."""
 LOST = 1e-9
@@ -134,6 +136,44 @@ def _test(name: str, columns: Numbers, windows: Sequence[_Window], every: int, p
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),
     )
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Ordinary against generalised least squares, which weigh frequencies differently, over windows side by side."""
+
+    ordinary: Numbers
+    """(p,) mean over the windows."""
+    generalised: Numbers
+    """(p,)"""
+    stderr: Numbers
+    """(p,) of the difference."""
+    p: Numbers
+    """(p,) probability of a difference as large as this where the model is right at all frequencies."""
+
+    def apart(self, k: int) -> bool:
+        """Whether a parameter differs beyond error, of all of them together, and by a share that matters."""
+        share = abs(self.ordinary[k] / self.generalised[k] - 1) if self.generalised[k] else 0.0
+        return bool(self.p[k] < FAMILYWISE / len(self.p) and share > SHARE)
+
+
+def compare_bands(ordinary: Numbers, generalised: Numbers) -> Bands | None:
+    """Compare the estimates (K, p) of windows that share no rows; None for fewer than `FEWEST_COMPARED`.
+
+    The error of the mean difference is that of its scatter between the windows: it needs no model of the noise, where
+    the difference of two covariances does (Hausman 1978).
+    """
+    from scipy.stats import t
+
+    known = np.isfinite(ordinary).all(axis=1) & np.isfinite(generalised).all(axis=1)
+    ordinary, generalised = ordinary[known], generalised[known]
+    count = len(ordinary)
+    if count < FEWEST_COMPARED:
+        return None
+    difference = ordinary - generalised
+    stderr = difference.std(axis=0, ddof=1) / np.sqrt(count)
+    size = np.abs(difference.mean(axis=0)) / np.where(stderr > 0, stderr, np.inf)
+    return Bands(ordinary.mean(axis=0), generalised.mean(axis=0), stderr, 2 * t.sf(size, count - 1))
 
 
 def significant(tests: Sequence[Misfit], level: float = FAMILYWISE) -> list[Misfit]:
