@@ -22,6 +22,9 @@ from jaximp.types import AnyArray, Numbers
 
 ORDERS = (0, 2, 4, 8, 16, 32)
 """Of autoregressions that are tried, one after the other."""
+FIRST_ORDERS, WORSE = 4, 6.0
+"""Order up to which sums are prepared at first, and how much worse the criterion may become before no higher order is
+tried."""
 ROWS_PER_TERM = 4
 """A window has so many independent rows for each term of the autoregression, at least."""
 FEWEST_WINDOWS = 20
@@ -30,6 +33,8 @@ LOST = 1e-10
 """A direction of a window's columns with a smaller share of their squares is left out: nothing is known of it."""
 LONGEST, NOTHING_MORE = 16, 0.001
 """Order of an autoregression of known noise, and the share of the error beyond it that is not worth more terms."""
+SETTLED = 1e-5
+"""Slope of the logarithm of the likelihood, per independent row, at which the search ends."""
 NEARLY_ONE, FARTHEST_START = 1 - 1e-9, 0.9999
 """Largest reflection coefficient, and that from which a longer autoregression is searched."""
 
@@ -104,6 +109,11 @@ class _Sums(NamedTuple):
     freedom: Numbers
     """(K,) independent rows less parameters."""
 
+    @property
+    def order(self) -> int:
+        """Highest order that they serve, P."""
+        return self.products.shape[1] - 1
+
 
 def fit_window_noise(
     W: Num[AnyArray, "N p"],
@@ -132,14 +142,18 @@ def fit_window_noise(
     if len(orders) < 2:
         return Autoregression(every=every)
     z = np.column_stack([W, y])
-    sums = _sums(z, stretches, orders[-1], every)
-    if sums is None:
-        return Autoregression(every=every)
-    best, start = (np.inf, np.zeros(0)), np.zeros(0)
+    sums, best, start = None, (np.inf, np.zeros(0)), np.zeros(0)
     for order in orders:
+        if sums is None or sums.order < order:
+            sums = _sums(z, stretches, min(orders[-1], max(4 * order, FIRST_ORDERS)), every)
+        if sums is None:
+            break
         start, value = _fit(sums, np.pad(start, (0, order - len(start))))
         small = rows / (rows - order - 1)  # Hurvich and Tsai 1989, for few rows
-        best = min(best, (value + 2 * order * small, start), key=lambda one: one[0])
+        criterion = value + 2 * order * small
+        if criterion > best[0] + WORSE:
+            break
+        best = min(best, (criterion, start), key=lambda one: one[0])
     return Autoregression(best[1], every)
 
 
@@ -216,7 +230,8 @@ def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, ever
     to_orthonormal, missing = _orthonormal(products[:, 0, 0, :q, :q])
     basis = np.zeros((len(kept), q + 1, q + 1))
     basis[:, :q, :q], basis[:, q, q] = to_orthonormal, 1
-    products = np.einsum("kax,kijab,kby->kijxy", basis, products, basis, optimize=True)
+    across = basis[:, None, None]
+    products = across.swapaxes(-1, -2) @ products @ across
     freedom = rows - q + missing.sum(axis=1)
     return _Sums(products, missing, np.array([len(runs) for runs in kept], float) / every, freedom)
 
@@ -259,7 +274,7 @@ def _fit(sums: _Sums, start: Numbers) -> tuple[Numbers, float]:
         return value / count, slope * NEARLY_ONE * (1 - np.tanh(u) ** 2) / count
 
     first = np.arctanh(np.clip(start, -FARTHEST_START, FARTHEST_START))
-    found = minimize(objective, first, jac=True, method="L-BFGS-B", options={"maxiter": 200})
+    found = minimize(objective, first, jac=True, method="BFGS", options={"maxiter": 200, "gtol": SETTLED})
     return NEARLY_ONE * np.tanh(found.x), float(found.fun * count)
 
 
@@ -267,16 +282,16 @@ def _likelihood(reflections: Numbers, products: Numbers, sums: _Sums) -> tuple[f
     """Minus twice the logarithm of the restricted likelihood of all windows, and its derivatives."""
     q = products.shape[-1] - 1
     a, slopes = _polynomial_and_slopes(reflections)
-    half = np.einsum("j,kijxy->kixy", a, products)
-    whole = np.einsum("i,kixy->kxy", a, half)
+    half = np.tensordot(products, a, (2, 0))
+    whole = np.tensordot(half, a, (1, 0))
     gram = whole[:, :q, :q] + sums.missing[:, :, None] * np.eye(q)
     inverse = np.linalg.inv(gram)
     theta = (inverse @ whole[:, :q, q:])[..., 0]
     floor = 1e-28 * products[:, 0, 0, q, q]  # data without noise
     rss = np.maximum(whole[:, q, q] - (whole[:, :q, q] * theta).sum(axis=1), 0) + floor
     residual = np.concatenate([-theta, np.ones((len(theta), 1))], axis=1)
-    of_rss = 2 * np.einsum("kx,kixy,ky->ki", residual, half, residual, optimize=True)
-    of_gram = 2 * np.einsum("kxy,kixy->ki", inverse, half[:, :, :q, :q])
+    of_rss = 2 * ((half @ residual[:, None, :, None])[..., 0] * residual[:, None]).sum(axis=-1)
+    of_gram = 2 * (inverse[:, None] * half[:, :, :q, :q]).sum(axis=(-1, -2))
     lags = np.arange(1, len(reflections) + 1)
     value = (sums.freedom * np.log(rss) + np.linalg.slogdet(gram)[1]).sum()
     value -= sums.runs.sum() * (lags * np.log1p(-(reflections**2))).sum()
