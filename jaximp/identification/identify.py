@@ -509,7 +509,7 @@ def _estimates(
     others = [text for name, text in differing.items() if name in judged and name not in off]
     why = "; ".join(filter(None, [why, *others]))
     measured = replace(measured, tested=bool(misfits), missing=why, remedy=remedy)
-    measured = judge_together(measured, fit, model.roles, np.asarray(held_out), apart)
+    measured = judge_together(measured, fit, model.roles, np.asarray(held_out), apart, limits)
     jumps = jump_note(recording, prepared.jumps)
     estimates = Estimates(
         model=model,

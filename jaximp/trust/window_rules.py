@@ -173,18 +173,22 @@ def judge_windows(windows: Windows, limits: TrustLimits = USUAL) -> Verdicts:
     return judge_all(RULES, usual, limits)
 
 
-def judge_together(windows: Windows, fit: SlidingFit, roles: Sequence[Role], held_out: Numbers, apart: int) -> Windows:
-    """With what only many windows can tell.
+def judge_together(
+    windows: Windows, fit: SlidingFit, roles: Sequence[Role], held_out: Numbers, apart: int, limits: TrustLimits = USUAL
+) -> Windows:
+    """With what only many windows can tell, of those whose motion says something.
 
     **Arguments:** `held_out` (M,) how each window predicts the next; windows `apart` of each other share no rows.
     """
-    known = held_out[np.isfinite(held_out)]
+    excited = judge_all(EXCITATION, windows, limits).trusted
+    known = held_out[excited & np.isfinite(held_out)]
     worse = len(known) >= FEWEST_TOGETHER and float(np.median(known)) < 0
     below = -np.inf
     for k, role in enumerate(roles):
         theta, stderr = (np.asarray(x)[::apart, k] for x in (fit.theta, fit.stderr))
-        counts = np.isfinite(theta) & (stderr > 0)
-        if role in MASSES and counts.sum() >= FEWEST_TOGETHER:
+        counts = excited[::apart] & np.isfinite(theta) & (stderr > 0)
+        # In most of them: a single window whose model is wrong must not speak for all.
+        if role in MASSES and counts.sum() >= FEWEST_TOGETHER and np.mean(theta[counts] < 0) > 0.5:
             weight = 1 / stderr[counts] ** 2
             below = max(below, float(-(weight * theta[counts]).sum() / np.sqrt(weight.sum())))
     return replace(windows, worse_than_nothing=worse, mass_below_zero=below)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -26,6 +28,7 @@ from jaximp.identification.identify import (
     solve_windows,
 )
 from jaximp.identification.solving import Solved, place_windows
+from jaximp.identification.whitening import from_white
 from jaximp.jobs.job import Job, parse_job
 from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares
@@ -87,6 +90,7 @@ def stacked(job: Job, recordings: list[Recording], padded: int, size: int) -> li
 def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) -> None:
     recordings, old, new = CASES[case]
     job = parse_job(JOB.replace(old, new) if old else JOB)
+    job = replace(job, window=replace(job.window, noise="filtered"))
     prepared = stacked(job, recordings[:1], 1400, 2)[0]
     trusted = in_windows(prepared, curves=False)[0].verdicts.trusted
     assert trusted.any()
@@ -97,6 +101,26 @@ def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) 
         fit = sliding_least_squares(*given, place.window, place.step, valid=rows.valid, noise=prepared.noise)
         unseen = score(*given, rows.valid, fit.theta, place.next_starts, place.window, place.step)
         assert_near(found, fit, unseen, trusted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["slow samples", "two joints"])
+def test_white_rows_of_a_stack_are_solved_as_one_by_one(case: str) -> None:
+    recordings, old, new = CASES[case]
+    prepared = stacked(parse_job(JOB.replace(old, new) if old else JOB), recordings[:1], 1400, 2)[0]
+    trusted = in_windows(prepared, curves=False)[0].verdicts.trusted
+    assert trusted.any()
+    for j, (joint_columns, found) in enumerate(zip(_columns_by_joint(prepared.model), prepared.solved, strict=True)):
+        rows, white = (
+            prepared.rows if joint_columns is None else prepared.rows.of_joint(*joint_columns),
+            prepared.white[j],
+        )
+        place = place_windows(prepared.pipeline, rows)
+        slide = partial(sliding_least_squares, window=place.window, step=place.step, valid=rows.valid)
+        hold = partial(score, rows.W, rows.torque, rows.valid, window=place.window, step=place.step)
+        fit = slide(white.W, white.torque)
+        fit = from_white(fit, slide(rows.W, rows.torque), white, hold(fit.theta, start=place.starts))
+        assert_near(found, fit, hold(fit.theta, start=place.next_starts), trusted)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -123,7 +147,7 @@ def test_the_members_of_a_stack_do_not_touch_each_other() -> None:
 @pytest.mark.slow
 def test_one_window_as_long_as_the_recording() -> None:
     """A program of a few windows only once made XLA break off the process."""
-    job = parse_job(JOB.replace("decimation_cutoff = 10", "").replace("length = 1", "length = 4"))
+    job = parse_job(JOB.replace("decimation_cutoff = 10", "").replace("length = 1", "length = 4\nnoise = 'filtered'"))
     recording = joint(1000)
     prepared = prepare(job.pipeline_for(recording), recording)
     theta, rows = in_windows(prepared)[0].fit.theta, prepared.rows
