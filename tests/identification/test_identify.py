@@ -153,6 +153,7 @@ def test_emps_is_the_published_joint(data_folder: Path) -> None:
         [window]
         length = 5
         step = 0.2
+        noise = "filtered"
         """,
         data_folder,
     )

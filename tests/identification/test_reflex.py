@@ -313,21 +313,23 @@ def test_windows_are_those_of_numpy_and_the_gain_has_its_covariance() -> None:
     job = parse_job(JOB)
     prepared = prepare(job.pipeline_for(joint()), joint())
     estimates = in_windows(prepared)[0]
-    rows, noise = prepared.rows, prepared.noise
-    (reflex,) = estimates.reflexes
+    rows, (white,), (reflex,) = prepared.rows, prepared.white, estimates.reflexes
     length = round(3 * RATE / prepared.pipeline.filters.decimate)
     for k in (1, 4):
         first = int(np.asarray(estimates.fit.first)[k])
         part = slice(first, first + length)
         counts = rows.valid[part]
-        W, y = np.asarray(rows.W)[part], np.asarray(rows.torque)[part]
+        W, y = np.asarray(white.W)[part], np.asarray(white.torque)[part]
         expected = np.linalg.lstsq(W[counts], y[counts], rcond=None)[0]
         np.testing.assert_allclose(np.asarray(estimates.fit.theta)[k], expected, rtol=1e-6, atol=1e-8)
-        window = least_squares(W, y, counts, noise)
-        one = reflex_gain(prepared.model, window.theta, window.covariance)
+        window = least_squares(W, y, counts)
+        # So many neighbouring rows say as much as one, and have so many times the squares of its residual.
+        freedom, every = counts.sum(), white.every
+        repeated = every * (freedom - W.shape[1]) / (freedom - every * W.shape[1])
+        one = reflex_gain(prepared.model, window.theta, repeated * window.covariance)
         np.testing.assert_allclose([reflex.gain[k], reflex.gain_stderr[k]], [one.gain, one.gain_stderr], rtol=1e-6)
         np.testing.assert_allclose(reflex.delay[k], one.delay)
-        np.testing.assert_allclose(np.asarray(estimates.fit.cond)[k], np.linalg.cond(W[counts]), rtol=1e-6)
+        np.testing.assert_allclose(np.asarray(estimates.fit.cond)[k], np.linalg.cond(rows.W[part][counts]), rtol=1e-6)
 
 
 def test_gain_and_delay_scatter_as_their_standard_errors_say() -> None:
