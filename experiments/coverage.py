@@ -1,17 +1,26 @@
-"""How often intervals hold the truth: 1000 simulated records of the rig through the paper's filters.
+"""How often intervals hold the truth, in two parts.
 
-The model with offset in a window of 2 s, white torque noise, quantised encoder or not, every 1st, 10th, 40th or 80th
-sample kept after the filters. Filtered once, with standard errors that know the filter and with the textbook's; and
-filtered inside the window, as the paper writes, with and without the rows at the window's ends that the edges disturb:
-there the inertia is biased. Writes experiments/results/coverage.json and coverage.md.
+1000 simulated records of the rig through the paper's filters (`filters`). The model with offset in a window of 2 s,
+white torque noise, quantised encoder or not, every 1st, 10th, 40th or 80th sample kept after the filters. Filtered
+once, with standard errors that know the filter and with the textbook's; and filtered inside the window, as the paper
+writes, with and without the rows at the window's ends that the edges disturb: there the inertia is biased. Writes
+experiments/results/coverage.json and coverage.md.
+
+2000 simulated records of an ankle a cell, through `identify` (`noise`): torque noise of every kind, short and long
+windows, slow and fast sampling, a high-pass, an encoder, several motions. Of each record one window counts, the middle
+one, whatever its verdict. Writes experiments/results/coloured_noise.json and coloured_noise.md.
+
+    python experiments/coverage.py [filters | noise] [--records 2000]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
 
+import ankles
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from jaximp import signals
+from jaximp.identification.identify import estimate
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import HumanJoint
 from jaximp.simulation import ROBOT_TRAJECTORY, HumanLoad, Rig, simulate_rig
@@ -33,6 +43,7 @@ TRUTH = {"inertia": 2e-6, "damping": 3e-5, "stiffness": 1e-3, "offset_torque": 0
 POSITION_FILTER = signals.butterworth(8, 10.0, RATE)
 PARALLEL_FILTER = signals.butterworth(4, 5.0, RATE)
 
+FOLDER = Path(__file__).parent / "results"
 Numbers = NDArray[np.float64]
 
 
@@ -148,7 +159,8 @@ def markdown(summary: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-if __name__ == "__main__":
+def of_filters() -> None:
+    """The first part."""
     generator = np.random.default_rng(2023)
     results = {
         f"{'quantised' if quantised else 'exact'} encoder, every {n}": run(quantised, n, generator)
@@ -156,7 +168,136 @@ if __name__ == "__main__":
         for n in DECIMATIONS
     }
     summary = summarise(results)
-    folder = Path(__file__).parent / "results"
-    (folder / "coverage.json").write_text(json.dumps({"summary": summary, "cells": results}, indent=1) + "\n")
-    (folder / "coverage.md").write_text(markdown(summary))
+    (FOLDER / "coverage.json").write_text(json.dumps({"summary": summary, "cells": results}, indent=1) + "\n")
+    (FOLDER / "coverage.md").write_text(markdown(summary))
     print(markdown(summary))
+
+
+# ---- Torque noise of every kind, through `identify`.
+
+NOISE_RECORDS = 2000
+CASES: dict[str, dict[str, Any]] = {
+    "usual": {},
+    "0.5 s": {"window": 0.5},
+    "5 s": {"window": 5.0},
+    "high-pass of 0.3 Hz": {"high_pass": 0.3},
+    "100 Hz": {"rate": 100.0},
+    "200 Hz": {"rate": 200.0},
+    "2000 Hz": {"rate": 2000.0},
+    "encoder of 0.3 mrad": {"encoder": 3e-4},
+    "multisine": {"motion": "multisine"},
+    "chirp": {"motion": "chirp"},
+    "steps": {"motion": "steps"},
+    "free swing": {"motion": "free swing"},
+}
+"""What differs from a random motion at 1 kHz in windows of 2 s."""
+PARAMETERS = ("inertia", "damping", "stiffness")
+ALLOWED, CLAIMED = 0.02, (0.9, 1.15)
+"""Target: coverage within so much and 3.5 Monte Carlo errors, and claimed over true standard deviation."""
+
+
+def noise_cell(noise: str, case: dict[str, Any], records: int, seed: int) -> dict[str, Any]:
+    """Coverage, claimed over true standard deviation and bias of every parameter, of independent records."""
+    settings = {"window": 2.0, "rate": ankles.RATE, "high_pass": None} | case
+    pipeline = ankles.pipeline(*(settings.pop(name) for name in ("rate", "window", "high_pass")))
+    theta, stderr, dof, trusted = [], [], [], []
+    for k in range(records):
+        random = np.random.default_rng((seed, k))
+        found = estimate(pipeline, ankles.record(random, noise, rate=pipeline.sample_rate, **settings))[0]
+        middle = len(found.value) // 2
+        theta.append(found.value[middle, :3])
+        stderr.append(found.stderr[middle, :3])
+        dof.append(found.dof[middle])
+        trusted.append(found.trusted[middle])
+    truth = np.array([ankles.TRUTH[name] for name in PARAMETERS])
+    error, claimed = np.array(theta) - truth, np.array(stderr)
+    half = {level: student.ppf(0.5 + level / 2, np.array(dof)) for level in LEVELS}
+    parameters = {
+        name: {f"{level:.0%}": float(np.mean(np.abs(error[:, k]) < half[level] * claimed[:, k])) for level in LEVELS}
+        | {
+            "claimed_over_true_sd": float(np.sqrt(np.mean(claimed[:, k] ** 2)) / error[:, k].std()),
+            "bias": float(error[:, k].mean() / truth[k]),
+            "bias_monte_carlo_error": float(error[:, k].std() / np.sqrt(records) / truth[k]),
+        }
+        for k, name in enumerate(PARAMETERS)
+    }
+    return {"records": records, "trusted": float(np.mean(trusted)), "parameters": parameters}
+
+
+def missed(cell: dict[str, Any]) -> list[str]:
+    """Which targets a cell misses, in words."""
+    found = []
+    for name, values in cell["parameters"].items():
+        for level in LEVELS:
+            error = np.sqrt(level * (1 - level) / cell["records"])
+            if abs(values[f"{level:.0%}"] - level) > ALLOWED + 3.5 * error:
+                found.append(f"{name}: {100 * values[f'{level:.0%}']:.0f} in intervals of {level:.0%}")
+        ratio, spread = values["claimed_over_true_sd"], 3.5 / np.sqrt(2 * cell["records"])
+        if not CLAIMED[0] * (1 - spread) <= ratio <= CLAIMED[1] * (1 + spread):
+            found.append(f"{name}: claims {ratio:.2f} of the true standard deviation")
+    return found
+
+
+def noise_table(cells: dict[str, dict[str, Any]]) -> str:
+    """A row a noise, over all cases; then coverage case by case; then what misses the targets."""
+    records = {cell["records"] for row in cells.values() for cell in row.values()}
+    cases = list(next(iter(cells.values())))
+    lines = [
+        f"{' or '.join(map(str, sorted(records)))} records a cell; inertia / damping / stiffness; the mean over "
+        f"{len(cases)} cells a noise, and the range of claimed over true standard deviation.",
+        "",
+        "| noise of the torque | 50 % | 80 % | 95 % | claimed / true | largest bias | trusted |",
+        "| --- |" + " --- |" * 6,
+    ]
+    for noise, row in cells.items():
+        each = [cell["parameters"] for cell in row.values()]
+        means = [
+            " / ".join(f"{100 * np.mean([one[name][f'{level:.0%}'] for one in each]):.1f}" for name in PARAMETERS)
+            for level in LEVELS
+        ]
+        ratios = [one[name]["claimed_over_true_sd"] for one in each for name in PARAMETERS]
+        biases = [one[name]["bias"] for one in each for name in PARAMETERS]
+        lines.append(
+            f"| {noise} | {' | '.join(means)} | {min(ratios):.2f} to {max(ratios):.2f} | "
+            f"{100 * max(biases, key=abs):+.1f} % | {100 * np.mean([c['trusted'] for c in row.values()]):.0f} % |"
+        )
+    lines += ["", "Intervals of 95 %, case by case:", ""]
+    lines += ["| | " + " | ".join(cases) + " |", "| --- |" + " --- |" * len(cases)]
+    for noise, row in cells.items():
+        shown = [" / ".join(f"{100 * c['parameters'][n]['95%']:.0f}" for n in PARAMETERS) for c in row.values()]
+        lines.append(f"| {noise} | " + " | ".join(shown) + " |")
+    values = [one for row in cells.values() for cell in row.values() for one in cell["parameters"].values()]
+    overall = [f"{np.mean([one[f'{level:.0%}'] for one in values]):.1%}" for level in LEVELS]
+    lines += ["", f"The mean over all cells: {', '.join(overall)} of the intervals of 50, 80 and 95 % hold the truth."]
+    every = [(f"{noise}, {case}", missed(cell)) for noise, row in cells.items() for case, cell in row.items()]
+    bad = [f"- {where}: {'; '.join(words)}" for where, words in every if words]
+    allowed = f"{100 * ALLOWED:.0f} points (or a ratio of {CLAIMED[0]} to {CLAIMED[1]}) and 3.5 Monte Carlo errors"
+    lines += [
+        "",
+        f"Of {len(every)} cells {len(bad)} miss a target by more than {allowed}{':' if bad else '.'}",
+        "",
+        *bad,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def of_noise(records: int) -> None:
+    """The second part; what is done so far stands in the files after every case."""
+    cells: dict[str, dict[str, Any]] = {noise: {} for noise in ankles.NOISES}
+    for c, (name, case) in enumerate(CASES.items()):
+        for k, noise in enumerate(cells):
+            cells[noise][name] = noise_cell(noise, case, records, 100 * c + k)
+        (FOLDER / "coloured_noise.json").write_text(json.dumps(cells, indent=1) + "\n")
+        (FOLDER / "coloured_noise.md").write_text(noise_table(cells))
+    print(noise_table(cells))
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("part", nargs="?", choices=("filters", "noise"), help="both where none is named")
+    arguments.add_argument("--records", type=int, default=NOISE_RECORDS, help="of every cell of the second part")
+    given = arguments.parse_args()
+    if given.part != "noise":
+        of_filters()
+    if given.part != "filters":
+        of_noise(given.records)

@@ -11,7 +11,8 @@ RECORDS = 400
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth_and_the_textbooks_do_not() -> None:
+def test_intervals_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "experiments")
     path = ROOT / "experiments" / "coverage.py"
     spec = importlib.util.spec_from_file_location("coverage_experiment", path)
     assert spec is not None

@@ -1,0 +1,87 @@
+"""What a model lacks is found, named, and sized: a small run of experiments/false_trust.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaximp.identification.estimates import Estimates
+from jaximp.identification.identify import estimate
+from jaximp.trust.score_tests import FAMILYWISE, significant
+from jaximp.trust.window_rules import NOTHING_MISSING
+
+RECORDS, SECONDS, RATE = 12, 40.0, 200.0
+LEAST = 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / RECORDS)
+"""Share of records in which it must be found, if it is in 95 % of all."""
+
+
+def identified(ankles: ModuleType, wrong: str | None, noise: str = "estimated", records: int = RECORDS) -> list[Any]:
+    """Estimates of records that differ in motion and noise."""
+    pipeline = ankles.pipeline(RATE, noise=noise)
+    joint = ankles.WRONG[wrong] if wrong else None
+    generators = [np.random.default_rng((20, k)) for k in range(records)]
+    return [
+        estimate(pipeline, ankles.record(random, wrong=joint, rate=RATE, seconds=SECONDS))[0] for random in generators
+    ]
+
+
+def share(estimates: Sequence[Estimates], name: str, says: str) -> float:
+    """Of the records that say this of the parameter."""
+    return float(np.mean([says in one.lacking.get(name, "") for one in estimates]))
+
+
+def changes(ankles: ModuleType, estimates: Sequence[Estimates], name: str) -> tuple[float, float, float]:
+    """Mean change that the tests say would bring the parameter to the truth, what would do it, and the error of their
+    difference."""
+    k, moves, needed = estimates[0].names.index(name), [], []
+    for one in estimates:
+        found = significant(one.misfits)
+        if found:
+            usual = np.median(one.value[:, k])
+            moves.append(found[0].move[k] / usual)
+            needed.append(ankles.TRUTH[name] / usual - 1)
+    error = np.std(np.subtract(moves, needed), ddof=1) / np.sqrt(len(moves))
+    return float(np.mean(moves)), float(np.mean(needed)), float(error)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words", "off", "spared"),
+    [
+        ("strong reflex, 4 N m s/rad", "a stretch reflex", "damping", ""),
+        ("Coulomb friction, 0.3 N m", "dry friction", "damping", "stiffness"),
+        ("torque 5 ms late", "a delay between torque and position", "inertia", "stiffness"),
+        ("cubic stiffness, +30 %", "a stiffness that depends on the angle", "stiffness", "damping"),
+    ],
+    ids=["reflex", "friction", "delay", "cubic"],
+)
+def test_what_is_missing_is_found_and_named(ankles: ModuleType, wrong: str, words: str, off: str, spared: str) -> None:
+    estimates = identified(ankles, wrong)
+    assert share(estimates, off, words) >= LEAST
+    assert np.mean([not one.trusted.any() for one in estimates]) >= LEAST
+    assert np.mean([not one.trusted_in(off).any() for one in estimates]) >= LEAST
+    if spared:
+        assert np.mean([one.trusted_in(spared).mean() > 0.9 for one in estimates]) >= LEAST
+    said, needed, error = changes(ankles, estimates, off)
+    assert said * needed > 0
+    assert said == pytest.approx(needed, abs=3.5 * error + 0.3 * abs(needed))
+
+
+def test_without_the_noise_nothing_is_tested_and_a_wrong_model_trusted(ankles: ModuleType) -> None:
+    """What the test above would find of `window.noise = 'filtered'`."""
+    for one in identified(ankles, "Coulomb friction, 0.3 N m", "filtered", records=3):
+        assert one.misfits == ()
+        assert one.trusted.all()
+
+
+def test_good_records_pass(ankles: ModuleType) -> None:
+    records = 60
+    estimates = identified(ankles, None, records=records)
+    alarms = np.mean([bool(significant(one.misfits)) for one in estimates])
+    assert alarms <= FAMILYWISE + 0.02 + 3.5 * np.sqrt(FAMILYWISE / records)
+    assert np.mean([one.trusted.mean() for one in estimates]) > 0.95
+    assert np.mean([(one.verdicts.rule == NOTHING_MISSING).any() for one in estimates]) <= alarms
+    assert not any(one.lacking for one in estimates if not significant(one.misfits))
