@@ -82,7 +82,7 @@ def wrong_cell(wrong: ankles.Wrong, motion: str, records: int, seed: int) -> dic
     return {
         "records": records,
         "harmful": max(abs(one["off"]) for one in parameters.values()) > SHARE,
-        "noticed": float(np.mean([bool(significant(e.misfits)) for e in all_found])),
+        "noticed": float(np.mean([bool(significant(e.misfits)) or depends(e) for e in all_found])),
         "found": float(np.mean([e.trusted.mean() < 0.5 for e in all_found])),
         "named rightly": float(np.mean([bool(one & right) for one in named])),
         "named rightly and nothing else": float(np.mean([bool(one) and one <= right for one in named])),
@@ -92,10 +92,16 @@ def wrong_cell(wrong: ankles.Wrong, motion: str, records: int, seed: int) -> dic
     }
 
 
+def depends(estimates: Estimates) -> bool:
+    """Whether any parameter is said to depend on the frequency."""
+    bands = estimates.bands
+    return bands is not None and any(bands.apart(k) for k in range(len(PARAMETERS)))
+
+
 def good_cell(settings: dict[str, Any], records: int, seed: int) -> dict[str, Any]:
     """How many good windows are trusted, of those that the filters left enough samples."""
     all_found = [identified((seed, k), settings) for k in range(records)]
-    alarms = [[one.group for one in significant(e.misfits)] for e in all_found]
+    alarms = [[one.group for one in significant(e.misfits)] + ["frequency"] * depends(e) for e in all_found]
     refused = Counter(rule for e in all_found for rule in np.asarray(e.verdicts.rule)[~e.trusted].tolist())
     return {
         "records": records,
