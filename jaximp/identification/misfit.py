@@ -16,8 +16,9 @@ from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording
 
-REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.03, 0.1, 0.3)
-"""How long the rectified velocity takes to the muscle, and time constants of its torque [s]; in both directions."""
+REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
+"""How long the rectified velocity takes to the muscle, and time constants of its torque, which builds up as behind a
+critically damped low-pass of second order [s]; in both directions."""
 SLOW = 0.3
 """Velocity below which dry friction builds up, as a share of its root mean square."""
 YIELDING = (0.01, 0.04)
@@ -57,13 +58,17 @@ class _Motion:
         a = np.exp(-1 / (seconds * self.rate)) if seconds else 0.0
         return np.asarray(lfilter([1 - a], [1, -a], x))
 
+    def twitch(self, x: Numbers, seconds: float) -> Numbers:
+        """The torque of a muscle that is told x."""
+        return self.yielding(self.yielding(x, seconds), seconds)
+
 
 SUSPECTS: Mapping[str, Suspect] = {
     "reflex": Suspect(
         "a stretch reflex",
         "try model.human.reflex = true",
         lambda m: [
-            m.yielding(m.later(np.maximum(sign * m.dq, 0), REFLEX_DELAY), seconds)
+            m.twitch(m.later(np.maximum(sign * m.dq, 0), REFLEX_DELAY), seconds)
             for sign in (1, -1)
             for seconds in MUSCLE
         ],

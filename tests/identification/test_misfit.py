@@ -57,7 +57,7 @@ def changes(ankles: ModuleType, estimates: Sequence[Estimates], name: str) -> tu
 @pytest.mark.parametrize(
     ("wrong", "words", "off", "spared"),
     [
-        ("strong reflex, 4 N m s/rad", "a stretch reflex", "damping", ""),
+        ("strong reflex, 4 N m s/rad", "a stretch reflex", "stiffness", ""),
         ("Coulomb friction, 0.3 N m", "dry friction", "damping", "stiffness"),
         ("torque 5 ms late", "a delay between torque and position", "inertia", "stiffness"),
         ("cubic stiffness, +30 %", "a stiffness that depends on the angle", "stiffness", "damping"),
