@@ -138,14 +138,14 @@ def fit_window_noise(
     rows = sum(sum(len(run) for run in runs) for runs in stretches) / every
     typical = np.median([sum(map(len, runs)) for runs in stretches]) / every if stretches else 0
     longest = max(parameters and (typical - parameters) / ROWS_PER_TERM, 0)
-    orders = [k for k in ORDERS if k <= min(longest, rows / FEWEST_WINDOWS)]
+    orders = [k for k in ORDERS if k <= min(longest, rows / FEWEST_WINDOWS) and 2 * k < _usual_run(stretches)]
     if len(orders) < 2:
         return Autoregression(every=every)
     z = np.column_stack([W, y])
     sums, best, start = None, (np.inf, np.zeros(0)), np.zeros(0)
     for order in orders:
         if sums is None or sums.order < order:
-            sums = _sums(z, stretches, min(orders[-1], max(4 * order, FIRST_ORDERS)), every)
+            sums = _sums(z, stretches, min(orders[-1], max(4 * order, FIRST_ORDERS)), every, orders[-1])
         if sums is None:
             break
         start, value = _fit(sums, np.pad(start, (0, order - len(start))))
@@ -206,15 +206,27 @@ def _stretches(valid: NDArray[np.bool_], window: int, every: int) -> list[list[N
     return found
 
 
-def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, every: int) -> _Sums | None:
-    """Of the windows that say something of noise of this order; None where there is none."""
+def _usual_run(stretches: list[list[NDArray[np.int64]]]) -> int:
+    """Half of the rows stand in runs of at least so many."""
+    lengths = np.sort([len(run) for runs in stretches for run in runs])[::-1]
+    return int(lengths[np.searchsorted(np.cumsum(lengths), lengths.sum() / 2)]) if len(lengths) else 0
+
+
+def _sums(
+    z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, every: int, highest: int = 0
+) -> _Sums | None:
+    """Of the windows that say something of noise of this order; None where there is none.
+
+    Orders compare by the same rows only: `highest` is the last that will be tried, if it is above this one.
+    """
+    highest = max(order, highest)
     q, kept = z.shape[1] - 1, []
     size = np.sqrt((z**2).mean(axis=0))
     z = z / np.where(size > 0, size, 1)
     for runs in stretches:
         # The quadratic form of the likelihood holds for runs of at least twice the order.
-        runs = [run for run in runs if len(run) > 2 * order]
-        if sum(map(len, runs)) > (2 * q + order) * every and any(z[run, q].any() for run in runs):
+        runs = [run for run in runs if len(run) > 2 * highest]
+        if sum(map(len, runs)) > (2 * q + highest) * every and any(z[run, q].any() for run in runs):
             kept.append(runs)
     if not kept:
         return None

@@ -148,6 +148,30 @@ def test_white_noise_and_few_rows_need_no_autoregression() -> None:
     assert fit_window_noise(W, generator.normal(size=60), np.zeros(60, bool), 12).order == 0
 
 
+def gaps(*lengths: int) -> NDArray[np.bool_]:
+    """(4000,) windows of 200 rows that begin with runs of these lengths, a gap of one row after each."""
+    one = np.ones(200, bool)
+    one[np.cumsum(np.add(lengths, 1)) - 1] = False
+    return np.tile(one, 20)
+
+
+def test_orders_compare_by_the_same_rows() -> None:
+    """Short runs serve low orders only; without them the likelihood of a higher order is that of less data."""
+    orders = []
+    for seed in range(15):
+        W, y = rows(4000, seed=100 + seed)
+        orders.append(fit_window_noise(W, y, gaps(*[19] * 5), 200).order)
+    assert np.mean(np.array(orders) == 0) > 0.6
+
+
+def test_noise_is_found_between_many_gaps() -> None:
+    """No run of 39 rows serves an order of 32, and those of lower orders are not lost by it."""
+    generator = np.random.default_rng(12)
+    W, _ = rows(4000, seed=13)
+    found = fit_window_noise(W, sample(NOISE, 4000, generator), gaps(39, 39, 39, 39, 39), 200)
+    np.testing.assert_allclose(found.polynomial[:4], NOISE.polynomial, atol=0.1)
+
+
 def test_a_window_without_motion_and_one_without_noise_harm_nothing() -> None:
     generator = np.random.default_rng(10)
     W, _ = rows(1200, seed=11)
