@@ -35,6 +35,9 @@ LONGEST, NOTHING_MORE = 16, 0.001
 """Order of an autoregression of known noise, and the share of the error beyond it that is not worth more terms."""
 SETTLED = 1e-5
 """Slope of the logarithm of the likelihood, per independent row, at which the search ends."""
+ROUNDING = 1e-15
+"""Of sums of products: so much is left of a column at least where a long step of the search goes to noise that takes it
+away."""
 NEARLY_ONE, FARTHEST_START = 1 - 1e-9, 0.9999
 """Largest reflection coefficient, and that from which a longer autoregression is searched."""
 
@@ -296,7 +299,8 @@ def _likelihood(reflections: Numbers, products: Numbers, sums: _Sums) -> tuple[f
     a, slopes = _polynomial_and_slopes(reflections)
     half = np.tensordot(products, a, (2, 0))
     whole = np.tensordot(half, a, (1, 0))
-    gram = whole[:, :q, :q] + sums.missing[:, :, None] * np.eye(q)
+    rounding = ROUNDING * np.abs(a).sum() ** 2
+    gram = whole[:, :q, :q] + (sums.missing[:, :, None] + rounding) * np.eye(q)
     inverse = np.linalg.inv(gram)
     theta = (inverse @ whole[:, :q, q:])[..., 0]
     floor = 1e-28 * products[:, 0, 0, q, q]  # data without noise

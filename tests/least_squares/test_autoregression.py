@@ -9,6 +9,7 @@ from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
 
 from jaximp.least_squares.autoregression import (
+    NEARLY_ONE,
     Autoregression,
     _likelihood,
     _stretches,
@@ -146,6 +147,20 @@ def test_white_noise_and_few_rows_need_no_autoregression() -> None:
     W, _ = rows(60, seed=9)
     assert fit_window_noise(W, generator.normal(size=60), np.ones(60, bool), 12).order == 0
     assert fit_window_noise(W, generator.normal(size=60), np.zeros(60, bool), 12).order == 0
+
+
+def test_a_long_step_of_the_search_ends_nothing() -> None:
+    """Twice differenced, nothing is left of a constant, and of a slow motion little."""
+    random, t = np.random.default_rng(0), np.arange(4000) / 100
+    W = np.column_stack([np.sin(8.2 * t) + 0.1 * random.normal(size=4000), np.cos(8.2 * t), np.ones(4000)])
+    z = np.column_stack([W, random.normal(size=4000)])
+    sums = _sums(z, _stretches(np.ones(4000, bool), 200, 1), 8, 1)
+    assert sums is not None
+    for order in (2, 4, 8):
+        products = sums.products[:, : order + 1, : order + 1]
+        for signs in random.choice([-1, 1], size=(40, order)):
+            value, slopes = _likelihood(NEARLY_ONE * signs, products, sums)
+            assert np.isfinite([value, *slopes]).all()
 
 
 def gaps(*lengths: int) -> NDArray[np.bool_]:
