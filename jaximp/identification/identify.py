@@ -494,7 +494,7 @@ def _estimates(
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
     size = np.abs(np.nanmedian(np.asarray(fit.theta), axis=0)) if misfits else np.zeros(0)
-    of_model = (misfits, model.names, size)
+    of_model = (misfits, model.names, size, [role.kind for role in model.roles])
     off, judged = off_by(*of_model), judged_names(model, limits)
     why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
     apart = -(-place.window // place.step) if not place.separate else max(1, int(place.next_starts[0] // place.window))
@@ -535,7 +535,7 @@ def _estimates(
         misfits=misfits,
         bands=bands,
         noise=noise,
-        lacking=differing
+        lacking={name: text for name, text in differing.items() if name not in weights}
         | {name: in_words(misfits, {name: share}) for name, share in off.items() if name not in weights},
     )
     about = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)

@@ -14,7 +14,7 @@ from jaximp.identification.regression import measured_motion
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
-from jaximp.types import AnyArray, Numbers, Recording
+from jaximp.types import AnyArray, Numbers, Recording, listed
 
 REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
 """How long the rectified velocity takes to the muscle, and time constants of its torque, which builds up as behind a
@@ -100,6 +100,8 @@ SUSPECTS: Mapping[str, Suspect] = {
     ),
 }
 """Who is asked, by name."""
+HIDES = {"lag": "stiffness"}
+"""Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
 
 
 def find_misfits(
@@ -165,14 +167,26 @@ def _motion_of(pipeline: Pipeline, recording: Recording) -> _Motion:
     return _Motion(recording.time, q, dq, ddq, jerk, snap, rate)
 
 
-def off_by(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers) -> dict[str, float]:
-    """Parameters that what is missing moves beyond error and `SHARE` of their `size` (p,); by what share."""
+def off_by(
+    misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()
+) -> dict[str, float]:
+    """Parameters that what is missing moves beyond error and `SHARE` of their `size` (p,), by what share; NaN where it
+    may move them so far, but how far cannot be told.
+
+    **Arguments:** `kinds` (p,) of the parameters' roles.
+    """
     found: dict[str, float] = {}
     for one in _suspected(misfits):
         for k, name in enumerate(names):
-            share = one.move[k] / size[k] if size[k] > 0 else 0.0
-            if abs(one.move[k]) > ERRORS * one.stderr[k] and abs(share) > SHARE:
+            share, error = (x[k] / size[k] if size[k] > 0 else 0.0 for x in (one.move, ERRORS * one.stderr))
+            if abs(share) > max(error, SHARE):
                 found.setdefault(name, float(share))
+            elif error > SHARE:
+                found.setdefault(name, np.nan)
+    hidden = HIDES.get(_suspected(misfits)[0].group) if found else None
+    for name, kind in zip(names, kinds, strict=False):
+        if kind == hidden:
+            found.setdefault(name, np.nan)
     return found
 
 
@@ -189,8 +203,10 @@ def culprits(misfits: Sequence[Misfit]) -> str:
 
 def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     """Why these parameters cannot be trusted; empty where none is off."""
-    changes = ", ".join(f"{name} would change by {share:+.0%}" for name, share in off.items())
-    return f"the model lacks {culprits(misfits)}: {changes}" if off else ""
+    changes = [f"{name} would change by {share:+.0%}" for name, share in off.items() if np.isfinite(share)]
+    open_ones = [name for name, share in off.items() if not np.isfinite(share)]
+    changes += [f"how far {listed(open_ones)} would change cannot be told"] if open_ones else []
+    return f"the model lacks {culprits(misfits)}: {', '.join(changes)}" if off else ""
 
 
 def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
@@ -210,21 +226,21 @@ def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, s
     return (in_words(misfits, off), SUSPECTS[significant(misfits)[0].group].remedy) if off else ("", "")
 
 
-def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers) -> str:
+def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
     """What is missing, but moves no parameter beyond error and `SHARE`: a note."""
-    if not significant(misfits) or off_by(misfits, names, size):
+    if not significant(misfits) or off_by(misfits, names, size, kinds):
         return ""
     return f"the model lacks {culprits(misfits)}, which moves no parameter by more than {SHARE:.0%} or beyond error"
 
 
-def unnoticed(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers) -> str:
+def unnoticed(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
     """How far each parameter might be off without any test noticing it: twice the largest error of a move."""
     if not misfits:
         return ""
     blind = ERRORS * np.max([one.stderr for one in misfits], axis=0)
     share: NDArray[np.float64] = blind / np.where(size > 0, size, np.inf)
     worst = misfits[int(np.argmax(np.max([one.stderr / np.where(size > 0, size, np.inf) for one in misfits], axis=1)))]
-    listed = ", ".join(f"{name} by {part:.0%}" for name, part in zip(names, share, strict=True) if part > SHARE)
-    if not listed:
+    blinded = ", ".join(f"{name} by {part:.0%}" for name, part in zip(names, share, strict=True) if part > SHARE)
+    if not blinded:
         return ""
-    return f"this motion cannot show everything: {SUSPECTS[worst.group].what}, say, could move {listed} unnoticed"
+    return f"this motion cannot show everything: {SUSPECTS[worst.group].what}, say, could move {blinded} unnoticed"

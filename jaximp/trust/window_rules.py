@@ -180,7 +180,7 @@ def judge_together(
 
     **Arguments:** `held_out` (M,) how each window predicts the next; windows `apart` of each other share no rows.
     """
-    excited = judge_all(EXCITATION, windows, limits).trusted
+    excited = judge_all(EXCITATION[:MOVES], windows, limits).trusted
     known = held_out[excited & np.isfinite(held_out)]
     worse = len(known) >= FEWEST_TOGETHER and float(np.median(known)) < 0
     below = -np.inf
@@ -296,6 +296,8 @@ EXCITATION: tuple[Rule[Windows], ...] = (
     ),
 )
 """What the motion must be for an estimate to say something."""
+MOVES = 3
+"""The first of them look at the motion alone."""
 
 RULES: tuple[Rule[Windows], ...] = (
     *EXCITATION,

@@ -11,7 +11,8 @@ import pytest
 
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
-from jaximp.trust.score_tests import FAMILYWISE, significant
+from jaximp.identification.misfit import harmless, in_words, off_by
+from jaximp.trust.score_tests import FAMILYWISE, Misfit, significant
 from jaximp.trust.window_rules import NOTHING_MISSING
 
 RECORDS, SECONDS, RATE = 12, 40.0, 200.0
@@ -91,3 +92,33 @@ def test_good_records_pass(ankles: ModuleType) -> None:
     assert np.mean([one.trusted.mean() for one in estimates]) > 0.95
     refused = np.mean([(one.verdicts.rule == NOTHING_MISSING).any() for one in estimates])
     assert refused <= FAMILYWISE + 0.02 + 3.5 * np.sqrt(FAMILYWISE / records)
+
+
+def found(group: str, move: list[float], stderr: list[float], evidence: float = 100.0) -> Misfit:
+    return Misfit(group, 1e-12, evidence + 10, evidence, np.ones(1), np.array(move), np.array(stderr))
+
+
+NAMED = ["inertia", "damping", "stiffness"], np.ones(3), ["inertia", "damping", "stiffness"]
+
+
+def test_what_yields_hides_how_stiff_the_joint_is() -> None:
+    lag = found("lag", [0.14, -0.01, 0.0], [0.01, 0.001, 0.0])
+    off = off_by([lag], *NAMED)
+    assert off["inertia"] == pytest.approx(0.14)
+    assert np.isnan(off["stiffness"])
+    assert "damping" not in off
+    assert in_words([lag], off).endswith("inertia would change by +14%, how far stiffness would change cannot be told")
+    late = found("delay", [0.14, -0.01, 0.0], [0.01, 0.001, 0.0], evidence=110)
+    assert "stiffness" not in off_by([lag, late], *NAMED)
+
+
+def test_a_move_that_is_not_determined_spares_nothing() -> None:
+    reflex = found("reflex", [0.03, 0.3, 0.02], [0.05, 0.02, 0.01])
+    off = off_by([reflex], *NAMED)
+    assert np.isnan(off["inertia"])
+    assert off["damping"] == pytest.approx(0.3)
+    assert "stiffness" not in off
+    assert harmless([reflex], *NAMED) == ""
+    small = found("reflex", [0.01, 0.02, 0.01], [0.001, 0.001, 0.001])
+    assert off_by([small], *NAMED) == {}
+    assert "a stretch reflex, which moves no parameter" in harmless([small], *NAMED)

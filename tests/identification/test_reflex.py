@@ -428,10 +428,12 @@ def test_the_ankle_with_a_reflex_is_explained_by_one(data_folder: Path) -> None:
     assert held_out["true"] > 0.86
     assert held_out["{ direction = -1 }"] < 0.75
     with_it = found["true"]
-    assert with_it.verdicts.counts()["poor fit"] == 0
-    assert with_it.verdicts.trusted.mean() > 0.8
-    inertia, damping, stiffness = with_it.mean_over_trusted()[:3]
+    # Ordinary least squares finds an inertia that is 8 % larger: it is not trusted, and spoils no other parameter.
+    assert "frequency" in with_it.lacking.get("inertia", "frequency")
+    for name in ("damping", "stiffness"):
+        assert with_it.trusted_in(name).mean() > 0.8
+    inertia, damping, stiffness = np.nanmedian(with_it.value, axis=0)[:3]
     assert inertia == pytest.approx(0.0158, rel=0.06)
     assert damping == pytest.approx(0.70, rel=0.15)
     assert stiffness == pytest.approx(57, rel=0.15)
-    assert with_it.reflexes[0].gain[with_it.verdicts.trusted].min() > 15
+    assert np.nanmin(with_it.reflexes[0].gain) > 15
