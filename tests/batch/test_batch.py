@@ -188,6 +188,7 @@ def test_where_nothing_is_trusted_it_is_said_why(tmp_path: Path) -> None:
         assert (outcome.doubted, outcome.doubt) == (1, f"rests.parquet: {reasons[1]}")
 
 
+@pytest.mark.slow
 def test_other_units_are_noticed(tmp_path: Path) -> None:
     """Of one recording alone nobody could tell; a soft joint among stiff ones is none of these."""
     for k in range(6):

@@ -77,6 +77,10 @@ CASES = {
 }
 
 
+LONGEST = ("lengths and rates", "robot", "white noise")
+"""To compile: they are left to `make test-all`."""
+
+
 def stacked(job: Job, recordings: list[Recording], padded: int, size: int) -> list[Prepared]:
     """Filtered and solved as a batch does it."""
     measured = [regression.measure(job.pipeline_for(recording), recording) for recording in recordings]
@@ -123,7 +127,9 @@ def test_white_rows_of_a_stack_are_solved_as_one_by_one(case: str) -> None:
         assert_near(found, fit, hold(fit.theta, start=place.next_starts), trusted)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] if case in LONGEST else []) for case in CASES]
+)
 def test_a_padded_recording_gives_what_it_gives_alone(case: str) -> None:
     """In a stack of its own length to the last bit, padded to rounding."""
     recordings, old, new = CASES[case]

@@ -68,6 +68,7 @@ def test_identify_writes_everything(run, job: Path) -> None:  # type: ignore[no-
     assert run("identify", job, "--out", out, "--force")[0] == 0
 
 
+@pytest.mark.slow
 def test_check_proposes(run, job: Path) -> None:  # type: ignore[no-untyped-def]
     status, said, _ = run("check", job)
     assert status == 0

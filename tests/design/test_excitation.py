@@ -331,6 +331,7 @@ def test_every_optimiser_finds_the_bottom_of_a_bowl(method: str) -> None:
     np.testing.assert_allclose(found.x, np.tile(target, (3, 1)), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_same_seed_same_design() -> None:
     one, other = (design_excitation(HUMAN, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.trajectory.sine, other.trajectory.sine)

@@ -102,6 +102,7 @@ def test_the_order_of_the_inertia_is_lakatos_or_named() -> None:
         design_perturbations(ARM, POSTURE, 0.3, np.asarray(heavy.borner), limits, **options)
 
 
+@pytest.mark.slow
 def test_every_joint_and_direction_has_its_own_limit() -> None:
     limits = Limits(position=((-0.01, -0.02), (0.05, 0.03)))
     found = design_perturbations(ARM, POSTURE, 0.3, INERTIA, limits, way_points=3, starts=2)

@@ -35,6 +35,7 @@ def test_intervals_hold_the_truth_in_coloured_noise(ankles: ModuleType, colour: 
         assert np.abs(held - level).max() < ALLOWED + 3.5 * np.sqrt(level * (1 - level) / RECORDS), (level, held)
 
 
+@pytest.mark.slow
 def test_intervals_that_take_coloured_noise_as_white_do_not(ankles: ModuleType) -> None:
     """What the test above would find of `window.noise = 'filtered'`."""
     stiffness = p_values(ankles, "pink", "filtered")[:, 2]

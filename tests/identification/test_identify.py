@@ -254,6 +254,7 @@ step = 0.5
 """
 
 
+@pytest.mark.slow
 def test_an_arm_is_identified_in_windows() -> None:
     stiffness = np.array([[29.0, 14.4], [14.4, 17.1]])
     estimates = identify_recording(parse_job(ARM), arm_recording(stiffness))[0]

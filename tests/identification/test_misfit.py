@@ -84,6 +84,7 @@ def test_without_the_noise_nothing_is_tested_and_a_wrong_model_trusted(ankles: M
         assert one.trusted.all()
 
 
+@pytest.mark.slow
 def test_good_records_pass(ankles: ModuleType) -> None:
     records = 60
     estimates = identified(ankles, None, records=records, seconds=24.0)

@@ -280,6 +280,7 @@ def test_a_jump_is_remembered() -> None:
     assert long[last + 201 : last + 1000].all()
 
 
+@pytest.mark.slow
 def test_without_the_reflex_the_stiffness_is_biased_and_with_it_right() -> None:
     with_it, without = (
         identified(),

@@ -138,6 +138,7 @@ def test_borner2020_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "| *paper* | 1.33 (1.16) | 1.60 (1.42) | 0.71 (0.62) | 3.04 (2.91) |" in (tmp_path / "tables.md").read_text()
 
 
+@pytest.mark.slow
 def test_replayed_torque_is_the_simulated_one() -> None:
     """With the true impedance and inertia, all that differs is that the stiffness is constant in the window."""
     arm = NeuromuscularArm()

@@ -60,6 +60,7 @@ def lanes_of(perturbed: Trials) -> Any:
 THETA = np.array([2.4, 1.2, 1.1, 1.4, 29.0, 14.0, 17.0, *np.linspace(-0.3, 0.3, 7), 0.19, 0.074, 0.084, 3.3e-4])
 
 
+@pytest.mark.slow
 def test_the_derivative_of_the_deviation_is_its_difference(trials: Simulated) -> None:
     lanes = lanes_of(trials.perturbed)
     of = eqx.filter_jit(module._deviation_in_bins)
