@@ -124,13 +124,14 @@ def test_a_model_that_lacks_something_predicts_worse(found: Inference) -> None:
 @pytest.mark.slow
 def test_draws_of_windows_that_cannot_be_trusted_are_not_believed() -> None:
     """A torque of which the model explains little has a posterior all the same."""
+    ordinary = parse_job(JOB.replace("[window]", "[window]\nnoise = 'filtered'"))
     recording = joint()
     drift = 8 * np.cumsum(np.random.default_rng(2).normal(0, 0.1, len(TIME)))[:, None]
-    found = infer_recording(parse_job(JOB), replace(recording, torque=recording.torque + drift))
+    found = infer_recording(ordinary, replace(recording, torque=recording.torque + drift))
     assert not found.good.all()
     assert not {window for one in found.changes for window in one.windows} & set(np.flatnonzero(~found.good))
     nothing = replace(recording, torque=5 * np.sin(2 * np.pi * 4.3 * TIME)[:, None] + 0.1 * recording.torque)
-    assert "no window can be trusted" in infer_recording(parse_job(JOB), nothing).why
+    assert "no window can be trusted" in infer_recording(ordinary, nothing).why
 
 
 def test_windows_without_samples_are_left_out() -> None:
