@@ -20,6 +20,7 @@ jax.config.update("jax_enable_x64", True)
 install_import_hook("jaximp", "shapes.checked")
 pytest.register_assert_rewrite("factories")
 
+CHOSEN = "JAX_DISABLE_MOST_OPTIMIZATIONS" in os.environ
 STORE = pytest.StashKey[Path]()
 MUCH_MEMORY = 1_500_000_000
 """Of one process [bytes]: compilers leave it full of holes, which are given back from here on."""
@@ -35,6 +36,22 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"] or None)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What most tests compile they run once: without XLA's optimisations that takes half as long.
+
+    Tests that compute for long (`slow`) and those of equal bits (`optimised`) run what users run. With
+    JAX_DISABLE_MOST_OPTIMIZATIONS=0 all do.
+    """
+    if CHOSEN:
+        return
+    quick = not any(item.get_closest_marker(name) for name in ("slow", "optimised"))
+    if item.get_closest_marker("optimised") and jax.config.read("jax_disable_most_optimizations"):
+        jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", quick)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # for processes that tests start
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -23,7 +23,13 @@ def test_a_report_stands_in_a_folder_of_its_own(tmp_path: Path, name: str) -> No
     assert not folder.name.startswith(".")
 
 
-REPORTS = [("none", []), ("failed", ["noise.parquet"]), ("all", ["good.parquet", "noise.parquet"])]
+REPORTS = [
+    ("failed", ["noise.parquet"]),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in [("none", []), ("all", ["good.parquet", "noise.parquet"])]
+    ),
+]
 
 
 @pytest.mark.parametrize(("reports", "expected"), REPORTS)

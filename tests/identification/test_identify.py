@@ -268,7 +268,9 @@ def test_an_arm_is_identified_in_windows() -> None:
 @pytest.mark.parametrize(
     ("stiffness", "why"),
     [
-        pytest.param(np.array([[29.0, 40.0], [40.0, 17.1]]), "not positive definite", id="indefinite"),
+        pytest.param(
+            np.array([[29.0, 40.0], [40.0, 17.1]]), "not positive definite", id="indefinite", marks=pytest.mark.slow
+        ),
         pytest.param(np.array([[29.0, 20.0], [2.0, 17.1]]), "not symmetric", id="asymmetric"),
     ],
 )

@@ -130,6 +130,7 @@ def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
         assert (of_D < 0.15 * K.max() / 12).all()
 
 
+@pytest.mark.slow
 def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -> None:
     alone = fit_of(trials)
     assert alone.K.shape == (2, 2)
@@ -139,7 +140,7 @@ def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -
     assert (alone.stderr[4:7] < fit.stderr[:, 4:7]).all()
 
 
-@pytest.mark.parametrize("late", [-3, 2, 32])
+@pytest.mark.parametrize("late", [-3, *(pytest.param(late, marks=pytest.mark.slow) for late in (2, 32))])
 def test_motion_that_lags_its_command_is_found(trials: Simulated, late: int) -> None:
     early = eqx.tree_at(lambda m: m.command, trials.perturbed, np.roll(trials.perturbed.command, -late, axis=1))
     fit = fit_of(eqx.tree_at(lambda t: t.perturbed, trials, early))

@@ -82,8 +82,9 @@ def test_optimum_is_that_of_a_convex_solver(damping: str) -> None:
         stiffness, damped = (size * one.value for one in theirs)
         ours = sum_of_squares(triangle, np.asarray(fit.D[k]), np.asarray(fit.K[k]))
         assert ours <= sum_of_squares(triangle, damped, stiffness) * (1 + 1e-11)
-        np.testing.assert_allclose(fit.K[k], stiffness, atol=1e-6 * size)
-        np.testing.assert_allclose(fit.D[k], damped, atol=1e-6 * size)
+        # The sum of squares is flat there: its solver ends anywhere within some 3e-6 of the size, ours does not.
+        np.testing.assert_allclose(fit.K[k], stiffness, atol=1e-5 * size)
+        np.testing.assert_allclose(fit.D[k], damped, atol=1e-5 * size)
 
 
 @pytest.mark.slow

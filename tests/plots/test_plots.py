@@ -72,7 +72,10 @@ def test_figure_renders_without_any_number(name: str, estimates: Estimates) -> N
     assert plots.png(FIGURES[name](replace(empty, held_out_vaf=np.full(len(empty.end), np.nan))))
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in ("methods", "window_lengths") else []) for name in FIGURES],
+)
 def test_long_recordings_are_thinned(name: str, estimates: Estimates) -> None:
     figure = FIGURES[name](repeat(estimates, 50_000, 1_000_000))
     lines = [line for panel in figure.axes for line in panel.get_lines()]

@@ -11,6 +11,7 @@ from factories.densities import Numbers
 from paths import ROOT
 
 
+@pytest.mark.slow
 def test_posteriors_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "experiments")
     experiment = importlib.import_module("calibration")

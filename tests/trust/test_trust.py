@@ -75,7 +75,11 @@ def beyond_four_errors(estimates: Estimates) -> NDArray[np.bool_]:
     return np.abs(theta - TRUTH["stiffness"]) > 4 * stderr
 
 
-noises = pytest.mark.parametrize("torque_noise", [0.02, 0.2, 2.0], ids=lambda level: f"torque noise {level:g} N m")
+noises = pytest.mark.parametrize(
+    "torque_noise",
+    [0.2, *(pytest.param(level, marks=pytest.mark.slow) for level in (0.02, 2.0))],
+    ids=lambda level: f"torque noise {level:g} N m",
+)
 seeds = pytest.mark.parametrize("seed", range(2), ids=lambda seed: f"seed {seed}")
 decimations = pytest.mark.parametrize("decimate", [None, 1], ids=["decimated", "every sample"])
 
