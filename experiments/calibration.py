@@ -120,22 +120,22 @@ def windows(n_samples: int, decimate: int) -> list[slice]:
 
 
 def rig(
-    quantised: bool, decimate: int, generator: np.random.Generator, *, samplers: bool = False
+    quantised: bool, decimate: int, generator: np.random.Generator, *, samplers: bool = False, records: int = RECORDS
 ) -> dict[str, dict[str, Any]]:
     """White torque noise, seen through the filters."""
     q, torque = motion(quantised)
     W = np.asarray(signals.filter_zero_phase(PARALLEL_FILTER, regressor(jnp.asarray(q))))
     ways = {"whitened": signals.autocovariance(PARALLEL_FILTER, decimate), "textbook": None}
-    records: dict[str, list[tuple[Numbers, float]]] = {way: [] for way in ways}
+    seen: dict[str, list[tuple[Numbers, float]]] = {way: [] for way in ways}
     for rows in windows(len(q), decimate):
-        measured = torque[:, None] + NOISE * generator.normal(size=(len(torque), RECORDS // POSITIONS))
+        measured = torque[:, None] + NOISE * generator.normal(size=(len(torque), records // POSITIONS))
         y = np.asarray(signals.filter_zero_phase(PARALLEL_FILTER, jnp.asarray(measured)))[rows]
         for way, noise in ways.items():
-            records[way] += whitened(W[rows], y, noise)
+            seen[way] += whitened(W[rows], y, noise)
     truth = true_values(np.log(NOISE) + np.log(signals.kept_variance(PARALLEL_FILTER)) / 2)
-    out = {way: judge(np.stack([exact(R, n, truth) for R, n in found]), RIG) for way, found in records.items()}
+    out = {way: judge(np.stack([exact(R, n, truth) for R, n in found]), RIG) for way, found in seen.items()}
     if samplers:
-        drawn = sampled([rig_density(R, n) for R, n in records["whitened"]], truth, generator)
+        drawn = sampled([rig_density(R, n) for R, n in seen["whitened"]], truth, generator)
         out |= {way: judge(u, RIG, refused) for way, (u, refused) in drawn.items()}
     return out
 
@@ -165,7 +165,7 @@ def drifting_rig(decimate: int, generator: np.random.Generator) -> dict[str, Any
     return {way: judge(np.stack(u), list(TRUTH)) for way, u in found.items()}
 
 
-def arm(generator: np.random.Generator, *, samplers: bool = False) -> dict[str, Any]:
+def arm(generator: np.random.Generator, *, samplers: bool = False, records: int = RECORDS) -> dict[str, Any]:
     """Perturbed movements of two joints with white noise: their triangles, drawn as the samples would make them.
 
     The motion's part of the triangle is fixed. The torque along it is Gaussian, what is left across it a Cholesky
@@ -178,7 +178,7 @@ def arm(generator: np.random.Generator, *, samplers: bool = False) -> dict[str, 
     velocity = np.gradient(displacement, 1 / 4000, axis=0)
     R = np.linalg.qr(np.hstack([velocity, displacement]), mode="r")
     coefficients, densities = np.vstack([DAMPING.T, STIFF.T]), []
-    for _ in range(RECORDS):
+    for _ in range(records):
         triangle = np.zeros((6, 6))
         triangle[:4, :4], triangle[:4, 4:] = R, R @ coefficients + ARM_NOISE * generator.normal(size=(4, 2))
         left = np.sqrt(generator.chisquare([ARM_SAMPLES - 4, ARM_SAMPLES - 5]))

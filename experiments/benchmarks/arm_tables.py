@@ -20,7 +20,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from jaximp.papers.arm_experiments import Case, run_case  # noqa: E402
-from jaximp.papers.borner2020 import AT_ONCE, SIMULATIONS, run  # noqa: E402
+from jaximp.papers.borner2020 import AT_ONCE, Sizes, run  # noqa: E402
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm  # noqa: E402
 
 COMPARED = ("feedback_jerk", "gomi_kawato")
@@ -39,7 +39,7 @@ def main() -> None:
     found: dict[str, Any] = {"machine": f"{os.cpu_count()} cores, {platform.machine()}"}
     jobs = [(Case(), (*COMPARED, "erden_billard"), True), *((case, COMPARED, False) for case in ALTERNATIVES)]
     found["first_run_s"] = sum(seconds(run, case, m, AT_ONCE, static) for case, m, static in jobs)
-    parts = [seconds(run, case, m, SIMULATIONS, static) for case, m, static in jobs]
+    parts = [seconds(run, case, m, Sizes().simulations, static) for case, m, static in jobs]
     found["tables_1A_and_2_s"], found["tables_1B_to_1D_s"] = parts[0], sum(parts[1:])
     found["all_s"] = sum(parts)
 

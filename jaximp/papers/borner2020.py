@@ -7,7 +7,8 @@ simulated subjects in place of the paper's participants.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,25 +43,13 @@ from jaximp.perturbation.trials import VOLUNTARY_DELAY, in_window
 from jaximp.simulation.neuromuscular import RATE, NeuromuscularArm, Reach
 from jaximp.types import Numbers, Progress
 
-SIMULATIONS = 10
-SEED, SEEDS = 0, 5
-"""The original configuration is simulated with so many seeds, ten times each; the others with the first."""
+SEED = 0
+"""The first of all seeds."""
 COMPARED = ("feedback_jerk", "gomi_kawato", "output_error")
 """Methods of tables 1 B to D and 2; the state at the onset stands in table 1 A only, as in the paper. The last one is
 not the paper's."""
 OTHERS = 120
 """Unperturbed trials beside the perturbed ones, where a method learns from them (the twins are the truth): 2.4.1."""
-CASES = {
-    "T_mov [s]": {value: Case(duration=value) for value in (1.0, 1.5, 2.0, 2.5, 3.0)},
-    "f_c,N [Hz]": {value: Case(cutoff=value) for value in (1.0, 1.5, 2.0, 2.5, 3.0)},
-    "alpha_N": {value: Case(amplitude=value) for value in (5.0, 8.75, 12.5, 16.25, 20.0)},
-}
-"""Figure 9; tables 1 B to D have the first, the middle and the last of each."""
-SUBJECTS = 12
-WINDOWS = np.arange(40, 180, 15) / 1000
-"""Lengths of the window that figure 12 compares [s]."""
-STATIC_WINDOWS = np.arange(100, 500, 50) / 1000
-"""Lengths of the window of the static task that figure 12 compares [s]."""
 AT_ONCE = 5
 """Simulations in one call; all ten need 3 GB of memory at 3 s."""
 SHOWN = ("D11", "D12", "D21", "D22", "K11", "K12", "K22")
@@ -93,6 +82,30 @@ PAPER: dict[str, Any] = {
     "peak_velocity_mm_s": {1.0: 747.8, 2.0: 377.6, 3.0: 254.0},
     "stiffness": [29.05, 14.37, 17.08],
 }
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is simulated; by default that which `docs/results.md` shows."""
+
+    simulations: int = 10
+    """Of every configuration, with every seed."""
+    seeds: int = 5
+    """The original configuration is simulated with so many seeds, the others with the first."""
+    cases: Mapping[str, Mapping[float, Case]] = field(
+        default_factory=lambda: {
+            "T_mov [s]": {value: Case(duration=value) for value in (1.0, 1.5, 2.0, 2.5, 3.0)},
+            "f_c,N [Hz]": {value: Case(cutoff=value) for value in (1.0, 1.5, 2.0, 2.5, 3.0)},
+            "alpha_N": {value: Case(amplitude=value) for value in (5.0, 8.75, 12.5, 16.25, 20.0)},
+        }
+    )
+    """Figure 9; tables 1 B to D have the first, the middle and the last of each."""
+    subjects: int = 12
+    """Of table 3."""
+    windows: tuple[float, ...] = tuple(k / 1000 for k in range(40, 180, 15))
+    """Lengths of the window that figure 12 compares [s], rising."""
+    static_windows: tuple[float, ...] = tuple(k / 1000 for k in range(100, 500, 50))
+    """Lengths of the window of the static task that figure 12 compares [s], rising."""
 
 
 class Errors(NamedTuple):
@@ -205,13 +218,13 @@ def table_two(errors: list[Errors]) -> dict[str, tuple[float, float | None]]:
     return {f"pi_{k + 1}": (float(inertia[k]), None) for k in range(3)} | found
 
 
-def compare_builds(seed: int = SEED, progress: Progress = lambda share: None) -> list[dict[str, Any]]:
+def compare_builds(sizes: Sizes, progress: Progress = lambda share: None) -> list[dict[str, Any]]:
     """Table 3 with simulated subjects: what was estimated of each, and what is true."""
     rows = []
-    for k in range(SUBJECTS):
-        arm = subject(seed + k)
+    for k in range(sizes.subjects):
+        arm = subject(SEED + k)
         # A subject is either perturbed or not: the cut-off frequencies come from other trials, as in 2.4.
-        (experiment,) = run_case(arm, Case(), jax.random.split(jax.random.key(1000 + seed + k), 1), others=120)
+        (experiment,) = run_case(arm, Case(), jax.random.split(jax.random.key(1000 + SEED + k), 1), others=120)
         assert experiment.postures is not None
         static = static_inertia(experiment.postures, arm.geometry)
         known = KnownArm(arm.geometry, static.inertia, arm.handle, static.inertia_stderr)
@@ -222,66 +235,80 @@ def compare_builds(seed: int = SEED, progress: Progress = lambda share: None) ->
             {
                 "inertia": np.asarray(static.inertia), "D": D, "K": K, "cutoff": np.asarray(found.cutoff),
                 "true_inertia": np.asarray(arm.inertia), "true_K": true, "true_D": np.asarray(arm.damping_time) * true,
-                "by_window": _by_window(experiment, known), "inertia_by_window": _inertia_by_window(experiment, arm),
+                "by_window": _by_window(experiment, known, np.array(sizes.windows)),
+                "inertia_by_window": _inertia_by_window(experiment, arm, sizes.static_windows),
             }
         )  # fmt: skip
-        progress((k + 1) / SUBJECTS)
+        progress((k + 1) / sizes.subjects)
     return rows
 
 
-def _by_window(experiment: Experiment, known: KnownArm) -> Numbers:
+def _by_window(experiment: Experiment, known: KnownArm, windows: Numbers) -> Numbers:
     """(windows, 8) damping and stiffness from all trials, for each length of the window: figure 12."""
     isolate = METHODS["feedback_jerk"].isolate
-    isolated = isolate(experiment.perturbed, experiment.unperturbed, known, window=float(WINDOWS[-1]))
+    isolated = isolate(experiment.perturbed, experiment.unperturbed, known, window=float(windows[-1]))
     joint = joint_deviations(experiment.perturbed, isolated.deviations, known)
     trials, samples, _ = joint.displacement.shape
-    inside = np.arange(samples) < np.round(WINDOWS * RATE)[:, None, None] + 1
-    every = (len(WINDOWS), trials, samples)
+    inside = np.arange(samples) < np.round(windows * RATE)[:, None, None] + 1
+    every = (len(windows), trials, samples)
     rows = [jnp.broadcast_to(x, (*every, 2)) for x in (joint.displacement, joint.velocity, joint.torque)]
     triangles = residual_triangle(rows[0], rows[1], rows[2], np.broadcast_to(inside, every))
     fit = fit_triangles(triangles, inside.sum(axis=-1))
     return np.concatenate([np.asarray(x).reshape(-1, 4) for x in (fit.D, fit.K)], axis=1)
 
 
-def _inertia_by_window(experiment: Experiment, arm: NeuromuscularArm) -> Numbers:
+def _inertia_by_window(experiment: Experiment, arm: NeuromuscularArm, windows: tuple[float, ...]) -> Numbers:
     """(windows, 3) base inertial parameters for each length of the static task's window."""
     assert experiment.postures is not None
-    seen = in_window(experiment.postures, round(STATIC_WINDOWS[-1] * RATE) + 1)
+    seen = in_window(experiment.postures, round(windows[-1] * RATE) + 1)
     time, no = np.arange(seen.position.shape[1]) / RATE, jnp.asarray(False)
-    fits = [static_fit(seen, arm.geometry, time < window + 0.5 / RATE, no) for window in STATIC_WINDOWS]
+    fits = [static_fit(seen, arm.geometry, time < window + 0.5 / RATE, no) for window in windows]
     return np.array([np.asarray(fit.inertia) for fit in fits])
 
 
 # Figures and tables.
 
 
-def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
-    """Write the figures, tables.json and tables.md into an existing folder."""
+def reproduce(folder: Path, progress: Progress = lambda share: None, sizes: Sizes | None = None) -> None:
+    """Write the figures, tables.json and tables.md into an existing folder; from less, if sizes are given."""
+    sizes = sizes or Sizes()
     original: dict[str, list[Errors]] = {name: [] for name in METHODS}
-    for k in range(SEEDS):
-        for name, errors in run(Case(), METHODS, SIMULATIONS, True, SEED + k).items():
+    for k in range(sizes.seeds):
+        for name, errors in run(Case(), METHODS, sizes.simulations, True, SEED + k).items():
             original[name] += errors
-        progress(0.2 * (k + 1) / SEEDS)
+        progress(0.2 * (k + 1) / sizes.seeds)
     swept: dict[str, dict[float, dict[str, list[Errors]]]] = {}
-    for k, (name, cases) in enumerate(CASES.items()):
+    for k, (name, cases) in enumerate(sizes.cases.items()):
         swept[name] = {}
         for i, (value, case) in enumerate(cases.items()):
             if case == Case():
-                swept[name][value] = {m: original[m][:SIMULATIONS] for m in COMPARED}
+                swept[name][value] = {m: original[m][: sizes.simulations] for m in COMPARED}
             elif value in PAPER[name]["FJI"]:
-                swept[name][value] = run(case, COMPARED, SIMULATIONS, True)
+                swept[name][value] = run(case, COMPARED, sizes.simulations, True)
             else:  # between what is tabulated, for the figure
-                swept[name][value] = run(case, COMPARED[:2], SIMULATIONS)
-            progress(0.2 + 0.5 * (k + (i + 1) / len(cases)) / len(CASES))
-    builds = compare_builds(progress=lambda share: progress(0.7 + 0.25 * share))
-    tables = _tables(original, swept, builds)
+                swept[name][value] = run(case, COMPARED[:2], sizes.simulations)
+            progress(0.2 + 0.5 * (k + (i + 1) / len(cases)) / len(sizes.cases))
+    builds = compare_builds(sizes, lambda share: progress(0.7 + 0.25 * share))
+    example = _example(sizes.simulations)
+    tables = _tables(original, swept, builds, example)
     (folder / "tables.json").write_text(json.dumps(tables, indent=1), encoding="utf-8")
     (folder / "tables.md").write_text(_markdown(tables), encoding="utf-8")
-    _draw(folder, original, swept, builds)
+    figures = {
+        "figure_4": (_profile_panels(), 2),
+        "figure_7": (_spectrum_panels(example), 2),
+        "figure_8": (_error_panels(original), 2),
+        "figure_9": (_sweep_panels(swept), 4),
+        "figure_12": (_window_panels(sizes, builds), 1),
+    }
+    for name, (panels, columns) in figures.items():
+        (folder / f"{name}.png").write_bytes(plots.png(plots.curves(panels, columns)))
+    (folder / "figure_11.png").write_bytes(plots.png(_ellipses(builds)))
     progress(1.0)
 
 
-def _tables(original: dict[str, list[Errors]], swept: dict[str, Any], builds: list[dict[str, Any]]) -> dict[str, Any]:
+def _tables(
+    original: dict[str, list[Errors]], swept: dict[str, Any], builds: list[dict[str, Any]], example: Experiment
+) -> dict[str, Any]:
     """Everything that is printed, beside the paper's numbers."""
     short = {name: METHODS[name].short for name in METHODS}
     parts = {
@@ -317,7 +344,7 @@ def _tables(original: dict[str, list[Errors]], swept: dict[str, Any], builds: li
             for row in builds
         ],
         "cutoff_Hz": {"mean": cutoffs.mean(axis=0).tolist(), "sd": cutoffs.std(axis=0, ddof=1).tolist()},
-        "deviations": _sizes(),
+        "deviations": _largest_deviations(example),
         "paper": PAPER,
         "calibrated": CALIBRATED,
         "why_the_numbers_differ": WHY,
@@ -342,14 +369,13 @@ def _tabulated(name: str, cases: dict[str, Any]) -> list[float]:
     return [value for value in sorted(PAPER[name]["FJI"]) if f"{value:g}" in cases]
 
 
-def _example() -> Experiment:
-    """The first simulation of the original configuration."""
-    return next(run_case(NeuromuscularArm(), Case(), jax.random.split(jax.random.key(SEED), SIMULATIONS)[:AT_ONCE]))
+def _example(simulations: int) -> Experiment:
+    """The first simulation of the original configuration, of so many."""
+    return next(run_case(NeuromuscularArm(), Case(), jax.random.split(jax.random.key(SEED), simulations)[:AT_ONCE]))
 
 
-def _sizes() -> dict[str, tuple[float, float]]:
+def _largest_deviations(experiment: Experiment) -> dict[str, tuple[float, float]]:
     """Mean (SD) over trials of the largest true deviations, with those of the static task's force."""
-    experiment = _example()
     true = true_deviations(experiment)
     assert experiment.postures is not None
     static = in_window(experiment.postures, round(0.4 * RATE) + 1).force
@@ -450,18 +476,6 @@ def _markdown(tables: dict[str, Any]) -> str:
     return "\n".join([*lines, "", *(f"- {reason}" for reason in tables["why_the_numbers_differ"]), ""])
 
 
-def _draw(folder: Path, original: dict[str, list[Errors]], swept: dict[str, Any], builds: list[dict[str, Any]]) -> None:
-    for name, panels, columns in (
-        ("figure_4", _profile_panels(), 2),
-        ("figure_7", _spectrum_panels(), 2),
-        ("figure_8", _error_panels(original), 2),
-        ("figure_9", _sweep_panels(swept), 4),
-        ("figure_12", _window_panels(builds), 1),
-    ):
-        (folder / f"{name}.png").write_bytes(plots.png(plots.curves(panels, columns)))
-    (folder / "figure_11.png").write_bytes(plots.png(_ellipses(builds)))
-
-
 def _ellipses(builds: list[dict[str, Any]]) -> Any:
     """Figure 11: impedance at the hand where the perturbation begins, of the mean over all subjects."""
     arm = NeuromuscularArm()
@@ -495,9 +509,8 @@ def _profile_panels() -> list[plots.Panel]:
     ]
 
 
-def _spectrum_panels() -> list[plots.Panel]:
+def _spectrum_panels(experiment: Experiment) -> list[plots.Panel]:
     """Figure 7B: spectra of one simulation, along both axes."""
-    experiment = _example()
     f, without, with_it = energy_spectra(experiment.perturbed, experiment.twins)
     low = (f > 0) & (f <= 12)
     return [
@@ -541,13 +554,14 @@ def _sweep_panels(swept: dict[str, Any]) -> list[plots.Panel]:
     return panels
 
 
-def _window_panels(builds: list[dict[str, Any]]) -> list[plots.Panel]:
+def _window_panels(sizes: Sizes, builds: list[dict[str, Any]]) -> list[plots.Panel]:
     """Figure 12: estimates over the length of the window, as shares of the truth, over all simulated subjects."""
     panels = []
+    windows, static_windows = np.array(sizes.windows), np.array(sizes.static_windows)
     for title, x, key, true, names in (
-        ("Inertia, static task", STATIC_WINDOWS, "inertia_by_window", "true_inertia", ("pi_1", "pi_2", "pi_3")),
-        ("Damping", WINDOWS, "by_window", "true_D", ELEMENTS[:4]),
-        ("Stiffness", WINDOWS, "by_window", "true_K", ELEMENTS[4:]),
+        ("Inertia, static task", static_windows, "inertia_by_window", "true_inertia", ("pi_1", "pi_2", "pi_3")),
+        ("Damping", windows, "by_window", "true_D", ELEMENTS[:4]),
+        ("Stiffness", windows, "by_window", "true_K", ELEMENTS[4:]),
     ):
         part = {"Damping": slice(0, 4), "Stiffness": slice(4, 8)}.get(title, slice(None))
         share = np.stack([row[key][:, part] / np.ravel(row[true]) for row in builds])

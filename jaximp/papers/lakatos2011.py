@@ -9,6 +9,9 @@ threshold is the range of what came out of them.
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,8 +37,6 @@ from jaximp.types import Numbers, Progress
 ARM = PlanarArm((0.0, 0.0))
 """Every trial has an equilibrium of its own."""
 RATE = 1000.0  # Hz
-DURATIONS = np.arange(5, 41) / 100
-"""T_k [s]. The paper ends at 0.3, and yet speaks of observations above 0.4."""
 OBSERVED = 0.07
 """By how much the observation is longer than the movement [s]."""
 BEFORE, AFTER = 0.15, 0.57
@@ -44,23 +45,12 @@ REPEATS = 5
 HELD_OUT = 29
 FILTER = FilterSettings(position_cutoff=100.0, position_order=4, decimation_cutoff=25.0, derivatives="central")
 """The paper says only that its low-pass is without phase."""
-FORCE_NOISE = np.array([0.02, 0.1, 0.5])  # N
-POSITION_NOISE = np.array([2e-6, 1e-5, 5e-5])  # m, with the noise of the force at the same place
-REFLEX_GAINS = np.array([0.0, 0.25, 0.5, 1.0])
-CUFFS: tuple[float | None, ...] = (None, 20e3, 5e3)
-"""Stiffness between robot and hand [N/m]; none where the hand follows exactly."""
-SEEDS = 2
-NOMINAL = (1, 1, 2, 0)
-"""Cuff, noise, gain and seed of the case that is drawn."""
 SAME = 0.1
 """An estimate is quasi-constant where all of it is within this share of its matrix's norm of the longest window's."""
 LIMITS = TrustLimits(min_vaf=0.9, max_asymmetry=0.05, max_relative_stderr=0.1)
 """The limits that the held-out torque, the antisymmetric part and the standard errors must keep here."""
 TABULATED = (0.05, 0.1, 0.2, 0.3)
 """T_k of which Table I is printed [s]."""
-WAY_POINTS = 4
-SHORTER = np.array([0.12, 0.17, 0.22, 0.27, 0.32, 0.37, 0.42, 0.47])
-"""Observations that perturbations are designed for [s]."""
 PAPER: dict[str, Any] = {
     "inertia": [0.391, 0.155, 0.149],
     "thresholds_ms": {
@@ -70,6 +60,35 @@ PAPER: dict[str, Any] = {
         "known inertia": 300,
     },
 }
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is swept; by default that which `docs/results.md` shows."""
+
+    durations: tuple[float, ...] = tuple(k / 100 for k in range(5, 41))
+    """T_k [s]. The paper ends at 0.3, and yet speaks of observations above 0.4."""
+    cuffs: tuple[float | None, ...] = (None, 20e3, 5e3)
+    """Stiffness between robot and hand [N/m]; none where the hand follows exactly."""
+    force_noise: tuple[float, ...] = (0.02, 0.1, 0.5)
+    """Standard deviations [N]."""
+    position_noise: tuple[float, ...] = (2e-6, 1e-5, 5e-5)
+    """Standard deviations [m], each with the noise of the force at the same place."""
+    reflex_gains: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
+    """Shares by which all reflexes together raise stiffness and damping."""
+    seeds: int = 2
+    """How many times each case is simulated."""
+    nominal: tuple[int, int, int, int] = (1, 1, 2, 0)
+    """Indices of cuff, noise, gain and seed of the case that is drawn."""
+    designed: tuple[float, ...] = (0.12, 0.17, 0.22, 0.27, 0.32, 0.37, 0.42, 0.47)
+    """Observations that perturbations are designed for [s]."""
+    way_points: int = 4
+    """Of every designed perturbation."""
+
+    @property
+    def observed(self) -> Numbers:
+        """Length of every observation [s]."""
+        return np.array(self.durations) + OBSERVED
 
 
 class Estimate(NamedTuple):
@@ -144,28 +163,29 @@ def _estimate(rows: TrialRows, solved: TrialRows, observed: Array, known: Array)
     return Estimate(fit, vaf, predicted[HELD_OUT])
 
 
-def cases(cuff: float | None) -> tuple[HeldArm, Array]:
+def cases(swept: Sweep, cuff: float | None) -> tuple[HeldArm, Array]:
     """Every noise with every strength of the reflexes and every seed, as one batch."""
-    index = np.indices((len(FORCE_NOISE), len(REFLEX_GAINS), SEEDS)).reshape(3, -1)
+    noise, gain, _ = np.indices((len(swept.force_noise), len(swept.reflex_gains), swept.seeds)).reshape(3, -1)
+    each = ((swept.force_noise, noise), (swept.position_noise, noise), (swept.reflex_gains, gain))
     held: dict[str, Any] = {} if cuff is None else {"yields": True, "cuff_stiffness": cuff}
     arms = eqx.filter_vmap(
         lambda force, position, gain: HeldArm(force_noise=force, position_noise=position, reflex_gain=gain, **held)
-    )(*(jnp.asarray(x) for x in (FORCE_NOISE[index[0]], POSITION_NOISE[index[0]], REFLEX_GAINS[index[1]])))
-    return arms, jax.vmap(jax.random.key)(jnp.arange(index.shape[1]))
+    )(*(jnp.asarray(np.array(values)[index]) for values, index in each))
+    return arms, jax.vmap(jax.random.key)(jnp.arange(len(noise)))
 
 
-def run(progress: Progress = lambda share: None) -> Outcome:
+def run(swept: Sweep, progress: Progress = lambda share: None) -> Outcome:
     """All cases: leading axes cuff, noise, reflex gain, seed, duration."""
     # "Known" is the true inertia. (The paper takes it from its own identification of everything.)
     inertia = jnp.asarray(HeldArm().inertia)
-    parts, n = [], len(FORCE_NOISE) * len(REFLEX_GAINS)
-    for cuff in CUFFS:
-        arms, keys = cases(cuff)
-        for k in range(n):
-            part = jax.tree.map(lambda x, k=k: x[SEEDS * k : SEEDS * (k + 1)], (arms, keys))
-            parts.append(jax.tree.map(np.asarray, sweep(part[0], part[1], jnp.asarray(DURATIONS), inertia)))
-            progress(len(parts) / (n * len(CUFFS)))
-    shape = (len(CUFFS), len(FORCE_NOISE), len(REFLEX_GAINS), SEEDS)
+    shape = (len(swept.cuffs), len(swept.force_noise), len(swept.reflex_gains), swept.seeds)
+    parts, together = [], swept.seeds
+    for cuff in swept.cuffs:
+        arms, keys = cases(swept, cuff)
+        for first in range(0, len(keys), together):
+            part = jax.tree.map(lambda x, first=first: x[first : first + together], (arms, keys))
+            parts.append(jax.tree.map(np.asarray, sweep(*part, jnp.asarray(swept.durations), inertia)))
+            progress(len(parts) * together / math.prod(shape))
     return jax.tree.map(lambda *x: np.concatenate(x).reshape(shape + x[0].shape[1:]), *parts)
 
 
@@ -203,11 +223,14 @@ def _as_at_the_end(theta: Numbers) -> NDArray[np.bool_]:
     return np.linalg.norm(theta - last, axis=-1) < SAME * np.linalg.norm(last, axis=-1)
 
 
-def thresholds(kept: NDArray[np.bool_]) -> Numbers:
-    """Shortest observation [s] from which on a criterion is met for all longer ones; infinite where it never is."""
+def thresholds(kept: NDArray[np.bool_], observed: Numbers) -> Numbers:
+    """Shortest observation [s] from which on a criterion is met for all longer ones; infinite where it never is.
+
+    **Arguments:** `kept` whether it is met, (..., durations); `observed` (durations,) lengths [s], rising.
+    """
     later = np.flip(np.logical_and.accumulate(np.flip(kept, axis=-1), axis=-1), axis=-1)
     first = later.argmax(axis=-1)
-    return np.where(later.any(axis=-1), DURATIONS[first] + OBSERVED, np.inf)
+    return np.where(later.any(axis=-1), observed[first], np.inf)
 
 
 def table_one(duration: float) -> dict[str, dict[str, Any]]:
@@ -228,11 +251,14 @@ def table_one(duration: float) -> dict[str, dict[str, Any]]:
     return found
 
 
-@jax.jit
-def noise_free_conditions(durations: Array) -> Array:
+def noise_free_conditions(durations: Numbers) -> Array:
     """Condition number (19) of the motion alone, over the observation sampled at 1 kHz."""
-    t = np.arange(round((DURATIONS.max() + OBSERVED) * RATE) + 1) / RATE
+    t = np.arange(round((durations.max() + OBSERVED) * RATE) + 1) / RATE
+    return _noise_free_conditions(jnp.asarray(durations), jnp.asarray(t))
 
+
+@jax.jit
+def _noise_free_conditions(durations: Array, t: Array) -> Array:
     def one(duration: Array) -> Array:
         inside = t < duration + OBSERVED + 0.5 / RATE
         return condition_of(ARM, HeldArm().posture, imposed_motion(DIRECTIONS, duration, t), inside)
@@ -240,7 +266,7 @@ def noise_free_conditions(durations: Array) -> Array:
     return jax.lax.map(one, durations)
 
 
-def shorter() -> dict[str, Any]:
+def shorter(swept: Sweep) -> dict[str, Any]:
     """Designed sets against the paper's, at the velocity and torque that its set for 370 ms reaches."""
     subject = HeldArm()
     reference = 0.3
@@ -248,69 +274,77 @@ def shorter() -> dict[str, Any]:
     away, dq, ddq = imposed_motion(DIRECTIONS, reference, t)
     torque = rigid_body_torque(subject.posture + away, dq, ddq, jnp.asarray(subject.inertia))
     limits = Limits((-0.05, 0.05), float(jnp.abs(dq).max()), torque=float(jnp.abs(torque).max()))
-    paper = np.asarray(noise_free_conditions(jnp.asarray(DURATIONS)))
-    wanted = float(paper[np.abs(DURATIONS - reference).argmin()])
+    paper = np.asarray(noise_free_conditions(np.array(swept.durations)))
+    wanted = float(paper[_nearest(swept, reference)])
     designed = [
-        design_perturbations(ARM, subject.posture, observed, subject.inertia, limits, way_points=WAY_POINTS)
-        for observed in SHORTER
+        design_perturbations(ARM, subject.posture, observed, subject.inertia, limits, way_points=swept.way_points)
+        for observed in swept.designed
     ]
     conditions = np.array([one.condition for one in designed])
     return {
         "limits": {"displacement": 0.05, "velocity": limits.velocity, "inertial_torque": limits.torque},
-        "observed": SHORTER.tolist(),
+        "observed": list(swept.designed),
         "designed": conditions.tolist(),
         "agreement_of_starts": [float(one.conditions[-1] / one.conditions[0]) for one in designed],
         "largest_displacement": [float(np.abs(one.points).max()) for one in designed],
-        "paper_observed": (DURATIONS + OBSERVED).tolist(),
+        "paper_observed": swept.observed.tolist(),
         "paper": paper.tolist(),
         "condition_of_the_paper_at_370_ms": wanted,
         # Both are straight lines on logarithmic scales.
-        "reached_at_s": float(np.exp(np.interp(-np.log(wanted), -np.log(conditions), np.log(SHORTER)))),
+        "reached_at_s": float(np.exp(np.interp(-np.log(wanted), -np.log(conditions), np.log(swept.designed)))),
     }
+
+
+def _nearest(swept: Sweep, duration: float) -> int:
+    """Index of the duration that is nearest to this one [s]."""
+    return int(np.abs(np.array(swept.durations) - duration).argmin())
 
 
 # Figures and tables.
 
 
-def reproduce(folder: Path, progress: Progress = lambda share: None) -> None:
-    """Write the figures, tables.json and tables.md into an existing folder."""
-    outcome = run(lambda share: progress(0.7 * share))
-    designed = shorter()
+def reproduce(folder: Path, progress: Progress = lambda share: None, swept: Sweep | None = None) -> None:
+    """Write the figures, tables.json and tables.md into an existing folder; of fewer cases if a sweep is given."""
+    swept = swept or Sweep()
+    outcome = run(swept, lambda share: progress(0.7 * share))
+    designed = shorter(swept)
     progress(0.95)
     kept = {which: met(outcome, which) for which in ("full", "reduced")}
     tables = {
         "paper": PAPER,
         "table_1": {f"{1e3 * duration:.0f} ms": table_one(duration) for duration in TABULATED},
         "thresholds_ms": {
-            which: {name: _band(thresholds(values)) for name, values in found.items()} for which, found in kept.items()
+            which: {name: _band(thresholds(values, swept.observed)) for name, values in found.items()}
+            for which, found in kept.items()
         },
-        "by_reflex_gain_ms": _by(kept, 2, {f"{gain:g}": k for k, gain in enumerate(REFLEX_GAINS)}),
-        "by_cuff_ms": _by(kept, 0, {_cuff_in_words(cuff): k for k, cuff in enumerate(CUFFS)}),
+        "by_reflex_gain_ms": _by(swept, kept, 2, [f"{gain:g}" for gain in swept.reflex_gains]),
+        "by_cuff_ms": _by(swept, kept, 0, [_cuff_in_words(cuff) for cuff in swept.cuffs]),
         "swept": {
-            "force_noise_N": FORCE_NOISE.tolist(),
-            "position_noise_m": POSITION_NOISE.tolist(),
-            "reflex_gain": REFLEX_GAINS.tolist(),
-            "cuff_N_per_m": list(CUFFS),
-            "seeds": SEEDS,
+            "force_noise_N": list(swept.force_noise),
+            "position_noise_m": list(swept.position_noise),
+            "reflex_gain": list(swept.reflex_gains),
+            "cuff_N_per_m": list(swept.cuffs),
+            "seeds": swept.seeds,
         },
         "shorter": designed,
         "why_the_numbers_differ": WHY,
     }
     (folder / "tables.json").write_text(json.dumps(tables, indent=1), encoding="utf-8")
     (folder / "tables.md").write_text(_markdown(tables), encoding="utf-8")
-    _draw(folder, outcome, designed)
+    _draw(folder, swept, outcome, designed)
     progress(1.0)
 
 
-def _by(kept: dict[str, dict[str, NDArray[np.bool_]]], axis: int, labels: dict[str, int]) -> dict[str, Any]:
+def _by(
+    swept: Sweep, kept: dict[str, dict[str, NDArray[np.bool_]]], axis: int, labels: Sequence[str]
+) -> dict[str, Any]:
     """Thresholds apart for each value of one thing that was swept."""
-    return {
-        which: {
-            name: {label: _band(thresholds(np.take(values, k, axis=axis))) for label, k in labels.items()}
-            for name, values in found.items()
-        }
-        for which, found in kept.items()
-    }
+
+    def apart(values: NDArray[np.bool_]) -> dict[str, Any]:
+        several = np.moveaxis(values, axis, 0)
+        return {label: _band(thresholds(one, swept.observed)) for label, one in zip(labels, several, strict=True)}
+
+    return {which: {name: apart(values) for name, values in found.items()} for which, found in kept.items()}
 
 
 def _cuff_in_words(cuff: float | None) -> str:
@@ -323,21 +357,21 @@ def _band(seconds: Numbers) -> dict[str, float | None]:
     return {name: round(1e3 * float(x)) if np.isfinite(x) else None for name, x in ends.items()}
 
 
-def _draw(folder: Path, outcome: Outcome, designed: dict[str, Any]) -> None:
-    one = jax.tree.map(lambda x: x[NOMINAL], outcome)
-    observed = 1e3 * (DURATIONS + OBSERVED)
+def _draw(folder: Path, swept: Sweep, outcome: Outcome, designed: dict[str, Any]) -> None:
+    one = jax.tree.map(lambda x: x[swept.nominal], outcome)
+    observed = 1e3 * swept.observed
     for name, estimate in (("figure_4", one.full), ("figure_5", one.reduced)):
         _save(folder, name, plots.curves(_panels(observed, estimate, one)))
     time = 1e3 * np.asarray(rows_time())
     panels = []
     for duration in (0.1, 0.2, 0.3):
-        k = int(np.abs(DURATIONS - duration).argmin())
+        k = _nearest(swept, duration)
         for joint in (0, 1):
             series = [(label, time, x[k][:, joint]) for label, x in _predictions(one)]
             title = f"joint {joint + 1}, T_obs = {1e3 * (duration + OBSERVED):.0f} ms"
             panels.append(plots.Panel(title, "time from the onset [ms]", "torque [N m]", series))
     _save(folder, "figure_6", plots.curves(panels))
-    _save(folder, "bias", plots.curves(_bias(observed, outcome)))
+    _save(folder, "bias", plots.curves(_bias(swept, outcome)))
     lines = [
         ("paper's set", 1e3 * np.array(designed["paper_observed"]), np.array(designed["paper"])),
         ("designed", 1e3 * np.array(designed["observed"]), np.array(designed["designed"])),
@@ -399,21 +433,21 @@ def _panels(observed: Numbers, estimate: Estimate, one: Outcome) -> list[plots.P
     return panels
 
 
-def _bias(observed: Numbers, outcome: Outcome) -> list[plots.Panel]:
+def _bias(swept: Sweep, outcome: Outcome) -> list[plots.Panel]:
     """What the paper could not draw: how far the estimate is from the mean of the truth, and from the one before any
     reflex. The mean over seeds at the middle noise."""
     x, y = "observation [ms]", "error of K [% of its norm]"
     panels = []
-    before = np.asarray(HeldArm().stiffness)
-    for k, cuff in enumerate(CUFFS):
+    before, observed, noise = np.asarray(HeldArm().stiffness), 1e3 * swept.observed, swept.nominal[1]
+    for k, cuff in enumerate(swept.cuffs):
         estimate = outcome.full
-        K = estimate.fit.theta[k, NOMINAL[1], ..., -4:].mean(axis=1).reshape(len(REFLEX_GAINS), -1, 2, 2)
-        mean = outcome.stiffness[k, NOMINAL[1]].mean(axis=1)
+        K = estimate.fit.theta[k, noise, ..., -4:].mean(axis=1).reshape(len(swept.reflex_gains), -1, 2, 2)
+        mean = outcome.stiffness[k, noise].mean(axis=1)
         for against, truth in (("its mean in the observation", mean), ("the one before any reflex", before)):
             share = np.linalg.norm(K - truth, axis=(-2, -1)) / np.linalg.norm(truth, axis=(-2, -1))
             lines = [
                 (f"reflexes +{gain:.0%}", observed, 100 * values)
-                for gain, values in zip(REFLEX_GAINS, share, strict=True)
+                for gain, values in zip(swept.reflex_gains, share, strict=True)
             ]
             panels.append(
                 plots.Panel(f"Stiffness against {against}: {_cuff_in_words(cuff)}", x, y, lines, (0.0, 110.0))
@@ -456,7 +490,7 @@ def _markdown(tables: dict[str, Any]) -> str:
         full, reduced = (_in_words(tables["thresholds_ms"][which][name]) for which in ("full", "reduced"))
         known = paper["known inertia"] if ("full", name) in theirs else "–"
         lines.append(f"| {name} | {theirs.get(('full', name), '–')} | {full} | {known} | {reduced} |")
-    cuffs = [_cuff_in_words(cuff) for cuff in CUFFS]
+    cuffs = [_cuff_in_words(cuff) for cuff in tables["swept"]["cuff_N_per_m"]]
     lines += ["", f"| all parameters, ms | {' | '.join(cuffs)} |", "| --- " * (1 + len(cuffs)) + "|"]
     for name in CRITERIA:
         cells = (_in_words(tables["by_cuff_ms"]["full"][name][cuff]) for cuff in cuffs)

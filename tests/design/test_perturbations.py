@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -43,7 +42,7 @@ def test_condition_of_the_papers_motions_is_an_independent_one() -> None:
     """All 26 durations of the paper."""
     durations = 0.04 + 0.01 * np.arange(1, 27)
     expected = [by_hand(duration) for duration in durations]
-    np.testing.assert_allclose(noise_free_conditions(jnp.asarray(durations)), expected, rtol=1e-8)
+    np.testing.assert_allclose(noise_free_conditions(durations), expected, rtol=1e-8)
     assert (np.diff(expected) < 0).all()
 
 

@@ -59,20 +59,20 @@ def test_convergence_time(values: list[float], settled: float, expected: float |
 
 
 @pytest.mark.slow
-def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lakatos2011_is_reproduced(tmp_path: Path) -> None:
     """A part of what is swept: the same code, fewer cases."""
-    for name, values in {
-        "FORCE_NOISE": lakatos2011.FORCE_NOISE[:2],
-        "POSITION_NOISE": lakatos2011.POSITION_NOISE[:2],
-        "REFLEX_GAINS": lakatos2011.REFLEX_GAINS[:3],
-        "SEEDS": 1,
-        "CUFFS": (None, 5e3),
-        "DURATIONS": np.array([0.1, 0.2, 0.3, 0.4]),
-        "SHORTER": np.array([0.27, 0.37]),
-        "WAY_POINTS": 3,
-    }.items():
-        monkeypatch.setattr(lakatos2011, name, values)
-    lakatos2011.reproduce(tmp_path)
+    usual = lakatos2011.Sweep()
+    swept = lakatos2011.Sweep(
+        durations=(0.1, 0.2, 0.3, 0.4),
+        cuffs=(None, 5e3),
+        force_noise=usual.force_noise[:2],
+        position_noise=usual.position_noise[:2],
+        reflex_gains=usual.reflex_gains[:3],
+        seeds=1,
+        designed=(0.27, 0.37),
+        way_points=3,
+    )
+    lakatos2011.reproduce(tmp_path, swept=swept)
     assert {path.stem for path in tmp_path.glob("*.png")} == {"figure_4", "figure_5", "figure_6", "bias", "shorter"}
     tables = json.loads((tmp_path / "tables.json").read_text())
     for duration, rows in tables["table_1"].items():
@@ -89,30 +89,27 @@ def test_lakatos2011_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "| stiffness positive definite | 320 |" in (tmp_path / "tables.md").read_text()
 
 
-def test_thresholds_hold_for_all_longer_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lakatos2011, "DURATIONS", np.array([0.1, 0.2, 0.3]))
+def test_thresholds_hold_for_all_longer_observations() -> None:
     kept = np.array([[True, False, True], [False, True, True], [True, True, False], [True, True, True]])
-    np.testing.assert_allclose(lakatos2011.thresholds(kept), [0.37, 0.27, np.inf, 0.17])
+    np.testing.assert_allclose(lakatos2011.thresholds(kept, np.array([0.17, 0.27, 0.37])), [0.37, 0.27, np.inf, 0.17])
 
 
 @pytest.mark.slow
-def test_borner2020_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_borner2020_is_reproduced(tmp_path: Path) -> None:
     """Two simulations in place of ten, and few of the configurations."""
-    for name, values in {
-        "SIMULATIONS": 2,
-        "SEEDS": 1,
-        "AT_ONCE": 2,
-        "CASES": {
-            "T_mov [s]": {2.0: borner2020.Case()},
-            "f_c,N [Hz]": {2.0: borner2020.Case()},
-            "alpha_N": {12.5: borner2020.Case(), 20.0: borner2020.Case(amplitude=20.0)},
+    sizes = borner2020.Sizes(
+        simulations=2,
+        seeds=1,
+        cases={
+            "T_mov [s]": {2.0: Case()},
+            "f_c,N [Hz]": {2.0: Case()},
+            "alpha_N": {12.5: Case(), 20.0: Case(amplitude=20.0)},
         },
-        "SUBJECTS": 2,
-        "WINDOWS": np.array([0.08, 0.115]),
-        "STATIC_WINDOWS": np.array([0.4]),
-    }.items():
-        monkeypatch.setattr(borner2020, name, values)
-    borner2020.reproduce(tmp_path)
+        subjects=2,
+        windows=(0.08, 0.115),
+        static_windows=(0.4,),
+    )
+    borner2020.reproduce(tmp_path, sizes=sizes)
     figures = {path.stem for path in tmp_path.glob("*.png")}
     assert figures == {"figure_4", "figure_7", "figure_8", "figure_9", "figure_11", "figure_12"}
     tables = json.loads((tmp_path / "tables.json").read_text(), parse_constant=pytest.fail)

@@ -15,9 +15,8 @@ from paths import ROOT
 def test_posteriors_hold_the_truth_and_the_textbooks_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "experiments")
     experiment = importlib.import_module("calibration")
-    monkeypatch.setattr(experiment, "RECORDS", 400)
     random = np.random.default_rng(11)
-    ways = {"rig": experiment.rig(True, 40, random), "arm": experiment.arm(random)}
+    ways = {"rig": experiment.rig(True, 40, random, records=400), "arm": experiment.arm(random, records=400)}
     for name, found in ways.items():
         for parameter, cell in found["whitened"].items():
             for level in (0.5, 0.8, 0.95):
