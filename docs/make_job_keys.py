@@ -23,7 +23,7 @@ from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.design import DesignSettings, EncoderSettings
-from jaximp.jobs.job import HumanSettings, Job, ModelSettings, ReflexSettings, RobotSettings
+from jaximp.jobs.job import HumanSettings, ModelSettings, ReflexSettings, RobotSettings, WindowJob
 from jaximp.jobs.trials import STATIC_WINDOW, HandleSettings, TrialsSettings, TriggerSettings
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
@@ -52,7 +52,7 @@ class Table:
 RECORDING_JOB = (
     Table(
         "At the top of the file",
-        Job,
+        WindowJob,
         "Keys that stand in no table, above the first one.",
         only=("reference_period", "design"),
     ),

@@ -24,7 +24,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from jaximp.identification import FilterSettings, WindowSettings, fit_robot
 from jaximp.identification.identify import noise_of, regress_pair
-from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings, identify_recording
+from jaximp.jobs import HumanSettings, ModelSettings, RobotSettings, WindowJob, identify_recording
 from jaximp.least_squares import sliding_theta
 from jaximp.simulation import HumanLoad
 from jaximp.simulation.rig_recordings import rig_recordings
@@ -35,7 +35,7 @@ jax.config.update("jax_enable_x64", True)
 RESULTS = Path(__file__).parents[1] / "results"
 RATE, WINDOW, DECIMATE, EVERY = 1000.0, 2000, 40, 20
 GEAR_RATIO, G = 15.0, 9.81
-JOB = Job(
+JOB = WindowJob(
     recording={},
     robot_recording={},
     model=ModelSettings(HumanSettings(gear_ratio=GEAR_RATIO), RobotSettings(GEAR_RATIO)),

@@ -24,7 +24,7 @@ from urllib.parse import quote
 import numpy as np
 
 from jaximp.identification.solving import stack_size
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers.formats import FORMATS, count_samples
@@ -107,7 +107,7 @@ class Plan:
         """Padded lengths, rising, and how many recordings are stacked."""
         return tuple(sorted({(batch.padded, batch.stacked) for batch in self.batches if batch.padded}))
 
-    def in_words(self, job: Job) -> list[str]:
+    def in_words(self, job: WindowJob) -> list[str]:
         """The plan, a line each."""
         items = self.items
         refused = [item for item in items if item.refused]
@@ -133,7 +133,7 @@ def _counted(count: int, one: str, several: str = "") -> str:
     return f"{count} {one if count == 1 else several or one + 's'}"
 
 
-def expected_bytes(job: Job, plan: Plan) -> float:
+def expected_bytes(job: WindowJob, plan: Plan) -> float:
     """Size of the results, as it was measured; windows are counted at the rate that the job states, or at 1 kHz."""
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
@@ -315,7 +315,7 @@ def why_refused(path: Path) -> str:
 # --- which are solved together ----------------------------------------------------------------------------------------
 
 
-def why_alone(job: Job) -> str:
+def why_alone(job: WindowJob) -> str:
     """Why the recordings of a job have to be identified one by one, or nothing."""
     if job.filter.mode == "window":
         return "filter.mode = 'window' filters inside every window"
@@ -326,15 +326,24 @@ def why_alone(job: Job) -> str:
     return ""
 
 
-def make_plan(job: Job, items: Sequence[Item], partitions: Sequence[str] | None = None) -> Plan:
+def of_recordings(job: Job) -> WindowJob:
+    """The job, if it is one for many recordings.
+
+    **Raises:** `ValueError` for a job with trials.
+    """
+    if isinstance(job, TrialsJob):
+        raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
+    return job
+
+
+def make_plan(job: WindowJob, items: Sequence[Item], partitions: Sequence[str] | None = None) -> Plan:
     """Look at every file's size and form batches.
 
     **Arguments:** `partitions` columns of the manifest; by default those of `PARTITIONS` that it has.
 
-    **Raises:** `ValueError` for a job without a recording's columns, and for partitions that cannot be folders.
+    **Raises:** `ValueError` for a robot's recordings that the job cannot read, and for partitions that cannot be
+    folders.
     """
-    if job.trials is not None:
-        raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
     if job.robot_recording is None and any(item.robot_file is not None for item in items):
         raise ValueError("the manifest has a robot_file, but the job no [robot_recording] to read it by: add the table")
     metadata = tuple(dict.fromkeys(key for item in items for key, _ in item.metadata))

@@ -31,7 +31,7 @@ from jaximp.identification.filter_settings import design_filters
 from jaximp.identification.identify import Prepared, in_windows, prepare, share_of_stack, solve_windows
 from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
@@ -68,7 +68,7 @@ class Interrupted(Exception):
 class Task:
     """What every batch of a run has in common; it travels to workers."""
 
-    job: Job
+    job: WindowJob
     out: Path
     metadata: tuple[str, ...]
     partitions: tuple[str, ...]
@@ -79,7 +79,7 @@ class Task:
     """`all`, `failed` (recordings without a trusted window), `none`, or the names of some."""
 
     @classmethod
-    def of(cls, job: Job, plan: Plan, out: Path, reports: str | tuple[str, ...] = "none") -> Task:
+    def of(cls, job: WindowJob, plan: Plan, out: Path, reports: str | tuple[str, ...] = "none") -> Task:
         return cls(job, out, plan.metadata, plan.partitions, plan.sizes, joints_of(job, plan.items), reports)
 
     def key(self, batch: Batch) -> str:
@@ -147,7 +147,7 @@ def file_checksum(path: Path | None) -> str:
         return ""
 
 
-def job_checksum(job: Job) -> str:
+def job_checksum(job: WindowJob) -> str:
     """Of the job file, and of the design and the robot's recording that it names."""
     design = "" if job.design is None else file_checksum((job.folder / job.design).resolve())
     robot = (job.robot_recording or {}).get("file")
@@ -374,7 +374,7 @@ def _prepared(several: Sequence[Measured], padded: int, stacked: int) -> list[Pr
     return [next(solved) if isinstance(one, Prepared) else one for one in results]
 
 
-def joints_of(job: Job, items: Sequence[Item]) -> int:
+def joints_of(job: WindowJob, items: Sequence[Item]) -> int:
     """Joints of a study: as many as the job names, or, where a variable may hold several, those of the first recording
     that can be read."""
     named = _named_joints(job)
@@ -386,7 +386,7 @@ def joints_of(job: Job, items: Sequence[Item]) -> int:
     return named
 
 
-def _named_joints(job: Job) -> int:
+def _named_joints(job: WindowJob) -> int:
     position = job.recording.get("position")
     position = position.get("column") if isinstance(position, Mapping) else position
     return 1 if isinstance(position, str) else len(position or "1")
@@ -513,7 +513,7 @@ def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.flo
     return found
 
 
-def reserved_columns(job: Job) -> set[str]:
+def reserved_columns(job: WindowJob) -> set[str]:
     """Names that a manifest's columns cannot have: those of the results."""
     nothing = [Result(Item("", Path()))]
     table, model = recordings_table(Task(job, Path(), (), (), (), 0), nothing), _model_of(job, nothing)
@@ -521,7 +521,7 @@ def reserved_columns(job: Job) -> set[str]:
     return {*table.column_names, *WINDOW_COLUMNS, *parameters, *(f"{name}_stderr" for name in parameters)}
 
 
-def _model_of(job: Job, results: Sequence[Result]) -> Model | None:
+def _model_of(job: WindowJob, results: Sequence[Result]) -> Model | None:
     """What is identified: of the recordings that could be read, or as the job's columns suggest."""
     first = next((result.about for result in results if result.about is not None), None)
     joints = None if first is None else first.joints
@@ -550,7 +550,7 @@ def _summarised(model: Model) -> list[tuple[str, str]]:
     return [*kept, *gains]
 
 
-def _filters(job: Job, about: About | None) -> str:
+def _filters(job: WindowJob, about: About | None) -> str:
     rate = None if about is None else about.sample_rate
     try:
         decimate = job.filter.decimate if rate is None else design_filters(job.filter, rate).decimate
@@ -618,7 +618,7 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
     return found.reason
 
 
-def write_report_of(job: Job, recording: Recording, alone: Recording | None, folder: Path) -> None:
+def write_report_of(job: WindowJob, recording: Recording, alone: Recording | None, folder: Path) -> None:
     """What `identify` writes, for one recording."""
     from jaximp.identification.identify import at_other_lengths
     from jaximp.recordings.outputs import new_folder

@@ -27,7 +27,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jaximp.batch.overview import Series, thinned, write_overview
-from jaximp.batch.plan import LOG, Batch, Item, Plan, find_items, make_plan
+from jaximp.batch.plan import LOG, Batch, Item, Plan, find_items, make_plan, of_recordings
 from jaximp.batch.results import (
     RUN_COLUMNS,
     UNFINISHED,
@@ -45,7 +45,7 @@ from jaximp.batch.results import (
     write_late_report,
     write_whole,
 )
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import Job, WindowJob
 from jaximp.least_squares.chunks import cores
 from jaximp.numerics.precision import require_float64
 from jaximp.plots.wording import main_parameter
@@ -130,12 +130,13 @@ def run(
 
     **Raises:** `ValueError` for what cannot be begun; `KeyboardInterrupt` ends cleanly.
     """
+    job = of_recordings(job)
     items = find_items([str(file) for file in files], None if manifest is None else Path(manifest), allow_outside)
     return run_plan(job, make_plan(job, items, partitions), out, workers, scheduler, resume, reports, tell)
 
 
 def run_plan(
-    job: Job,
+    job: WindowJob,
     plan: Plan,
     out: str | Path,
     workers: int = 0,
@@ -210,14 +211,14 @@ def _checked_reports(reports: str | Sequence[str], plan: Plan) -> str | tuple[st
     return names
 
 
-def check_metadata(job: Job, plan: Plan) -> None:
+def check_metadata(job: WindowJob, plan: Plan) -> None:
     """Refuse a manifest whose columns have the names of results."""
     for name in plan.metadata:
         if name in reserved_columns(job):
             raise ValueError(f"the manifest's column '{name}' has the name of a result: rename it")
 
 
-def first_trouble(job: Job, plan: Plan) -> str:
+def first_trouble(job: WindowJob, plan: Plan) -> str:
     """What the first recording that is to be read would fail by, if so: mostly all others would as well."""
     item = next((item for item in plan.items if not item.refused), None)
     if item is not None:

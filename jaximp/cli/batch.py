@@ -46,11 +46,11 @@ def batch(
     them. What fails is listed in quarantine.json, and the rest goes on; the exit status is 3 then. A run that was
     broken off goes on with --resume, which also writes reports that are asked for later.
     """
-    from jaximp.batch.plan import find_items, make_plan
+    from jaximp.batch.plan import find_items, make_plan, of_recordings
     from jaximp.batch.run import check_metadata, first_trouble, run_plan
     from jaximp.jobs.job import read_job
 
-    job = read_job(job_file)
+    job = of_recordings(read_job(job_file))
     plan = make_plan(job, find_items(files or [], manifest, allow_outside), partition)
     if dry_run:
         check_metadata(job, plan)

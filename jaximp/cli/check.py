@@ -11,7 +11,7 @@ from rich.table import Table
 from jaximp.cli.terminal import JobFile, bar_of
 
 if TYPE_CHECKING:
-    from jaximp.jobs.job import Job
+    from jaximp.jobs.job import TrialsJob
 
 
 def check(job_file: JobFile) -> None:
@@ -20,11 +20,11 @@ def check(job_file: JobFile) -> None:
     Proposes cut-off frequencies and a window for the job file. Of perturbation trials it says how many there are, and
     what the sensors allow.
     """
-    from jaximp.jobs.job import read_job
+    from jaximp.jobs.job import TrialsJob, read_job
     from jaximp.jobs.run import check as check_recording
 
     job = read_job(job_file)
-    if job.trials is not None:
+    if isinstance(job, TrialsJob):
         _check_trials(job)
         return
     with bar_of("checking") as progress:
@@ -41,12 +41,12 @@ def check(job_file: JobFile) -> None:
     )
 
 
-def _check_trials(job: Job) -> None:
+def _check_trials(job: TrialsJob) -> None:
     """How many trials were read, and what reading says of them."""
     from jaximp.perturbation.rules import DISAGREEMENT
     from jaximp.perturbation.sensors import handle_disagreement
 
-    for table in job.tables_of_trials():
+    for table in job.tables():
         perturbed, unperturbed, notes = table.load()
         kind = "perturbed postures" if table.task == "posture" else "perturbed movements"
         others = 0 if unperturbed is None else len(unperturbed)

@@ -14,7 +14,7 @@ from jaximp.cli.terminal import Force, JobFile, Out, bar_of, say_where
 
 if TYPE_CHECKING:
     from jaximp.identification.estimates import Estimates
-    from jaximp.jobs.job import Job
+    from jaximp.jobs.job import Job, TrialsJob
     from jaximp.perturbation.impedance import ArmImpedance
 
 
@@ -34,7 +34,9 @@ def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
 
 
 def identify_into(job: Job, folder: Path) -> None:
-    if job.trials is not None:
+    from jaximp.jobs.job import TrialsJob
+
+    if isinstance(job, TrialsJob):
         _identify_trials_into(job, folder)
         return
     from jaximp.identification.identify import at_other_lengths, in_windows
@@ -56,7 +58,7 @@ def identify_into(job: Job, folder: Path) -> None:
     _say_result(estimates[0])
 
 
-def _identify_trials_into(job: Job, folder: Path) -> None:
+def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
     from jaximp.jobs.run_trials import identify_trials
 
     Thread(target=import_module, args=("jaximp.reports.impedance",)).start()

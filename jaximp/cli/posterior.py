@@ -12,18 +12,19 @@ def posterior(job_file: JobFile, out: Out, force: Force = False) -> None:
 
     Writes the draws as NetCDF for ArviZ, summary.json, report.html and the figures into the folder.
     """
-    from jaximp.jobs.job import read_job
-    from jaximp.jobs.run import infer
-    from jaximp.jobs.run_trials import ArmInference
+    from jaximp.jobs.job import TrialsJob, read_job
+    from jaximp.jobs.run import infer_recording
+    from jaximp.jobs.run_trials import infer_trials
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.posterior import write_arm_posterior, write_posterior_results
 
     job = read_job(job_file)
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder, bar_of("sampling") as progress:
-        found = infer(job, lambda share: progress(0.9 * share))
-        if isinstance(found, ArmInference):
-            content = write_arm_posterior(folder, found, job)
+        if isinstance(job, TrialsJob):
+            content = write_arm_posterior(folder, infer_trials(job, lambda share: progress(0.9 * share)), job)
         else:
+            recording, alone = job.load(), job.load_robot_alone()
+            found = infer_recording(job, recording, alone, lambda share: progress(0.9 * share))
             content = write_posterior_results(folder, found, job)
     for line in [f"not to be trusted: {content['why']}"] if content["why"] else content["sentences"]:
         typer.echo(line)

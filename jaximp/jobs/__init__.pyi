@@ -7,6 +7,8 @@ from .job import Job as Job
 from .job import ModelSettings as ModelSettings
 from .job import ReflexSettings as ReflexSettings
 from .job import RobotSettings as RobotSettings
+from .job import TrialsJob as TrialsJob
+from .job import WindowJob as WindowJob
 from .job import parse_job as parse_job
 from .job import read_job as read_job
 from .run import check as check

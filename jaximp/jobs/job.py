@@ -1,4 +1,4 @@
-"""The job file: what to identify, from which recording, with which filters and windows.
+"""The job file: what to identify, from which recording or trials, with which filters and windows.
 
 A job is TOML. `read_job` checks every key and value and names the nearest known key where one is misspelt.
 """
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from jaximp.design.files import read_trajectory
 from jaximp.identification.filter_settings import FilterSettings
@@ -110,15 +110,15 @@ class ModelSettings:
     human: HumanSettings | None = None
     robot: RobotSettings | None = None
     arm: ArmSettings | None = None
-    """Whose joints were recorded, or of a job with `[trials]` the one whose hand was."""
+    """Whose joints were recorded."""
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
     beside it."""
 
 
 @dataclass(frozen=True)
-class Job:
-    """Everything that `identify` needs to know."""
+class WindowJob:
+    """Everything that is to be known of a recording, which is identified window by window."""
 
     recording: Mapping[str, Any]
     """The `[recording]` table: keywords of `load_recording`, and `file`."""
@@ -135,18 +135,14 @@ class Job:
     posterior: PosteriorSettings = field(default_factory=PosteriorSettings)
     folder: Path = Path()
     """Where relative file names start."""
-    trials: TrialsSettings | None = None
-    """In place of a recording: perturbation trials of an arm."""
     text: str = ""
     """The job file as written."""
 
     def load(self) -> Recording:
         """The recording to be identified.
 
-        **Raises:** `ValueError` for a job with trials, which `trials.load` reads, and as `load_recording`.
+        **Raises:** as `load_recording`.
         """
-        if self.trials is not None:
-            raise ValueError("this job has [trials] and no [recording]: read them by its trials.load()")
         return recording_from_mapping(self.recording, self.folder)
 
     def load_robot_alone(self) -> Recording | None:
@@ -161,13 +157,7 @@ class Job:
         """What the job reads."""
         tables = (self.recording, self.robot_recording or {})
         names = [str(table["file"]) for table in tables if "file" in table]
-        trials = [path for table in self.tables_of_trials() for path in table.paths()]
-        return [*(self.folder / name for name in (*names, self.design) if name is not None), *trials]
-
-    def tables_of_trials(self) -> list[TrialsSettings]:
-        """`[trials]` and `[trials.posture]`, as far as the job has them."""
-        tables = (self.trials, self.trials and self.trials.posture)
-        return [table for table in tables if table is not None]
+        return [self.folder / name for name in (*names, self.design) if name is not None]
 
     def models(self, joints: tuple[str, ...], sample_rate: float | None = None) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
@@ -204,6 +194,35 @@ class Job:
         return self.pipeline(recording.joints, recording.sample_rate)
 
 
+@dataclass(frozen=True)
+class TrialsJob:
+    """Everything that is to be known of perturbation trials, from which the impedance of an arm is identified."""
+
+    trials: TrialsSettings
+    arm: ArmSettings
+    """Whose hand was recorded."""
+    trust: TrustLimits = field(default_factory=TrustLimits)
+    posterior: PosteriorSettings = field(default_factory=PosteriorSettings)
+    text: str = ""
+    """The job file as written."""
+
+    def load(self) -> NoReturn:
+        """**Raises:** `ValueError`: there is no recording; `trials.load` reads the trials."""
+        raise ValueError("this job has [trials] and no [recording]: read them by its trials.load()")
+
+    def tables(self) -> list[TrialsSettings]:
+        """`[trials]`, and `[trials.posture]` where the job has it."""
+        return [self.trials] if self.trials.posture is None else [self.trials, self.trials.posture]
+
+    def files(self) -> list[Path]:
+        """What the job reads."""
+        return [path for table in self.tables() for path in table.paths()]
+
+
+Job = WindowJob | TrialsJob
+"""What a job file with measurements says; that of a design is a `DesignJob`."""
+
+
 @lru_cache(maxsize=64)
 def _side_by_side(
     one: RobotSettings | HumanSettings | None, joints: tuple[str, ...], sample_rate: float | None
@@ -236,7 +255,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     for table in ("recording", "robot_recording"):
         if table in tables and not isinstance(tables[table], dict):
             raise ValueError(f"[{table}] must be a table")
-    job = Job(
+    job = WindowJob(
         recording=tables["recording"],
         robot_recording=tables.get("robot_recording"),
         model=model_settings(tables["model"]),
@@ -253,7 +272,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     return job
 
 
-def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
+def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> TrialsJob:
     """A job whose trials stand in place of a recording, its filters and its windows."""
     for other in tables:
         if other not in ("trials", "model", "trust", "posterior"):
@@ -270,13 +289,10 @@ def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> Job:
         raise ValueError("model.arm.inertia and [trials.posture] both give the arm's inertia: keep one of them")
     trust = settings(TrustLimits, tables.get("trust", {}), "trust")
     _check_limits(trust)
-    window = WindowSettings(trials.window)
     posterior = posterior_settings(tables.get("posterior", {}))
     if posterior.prior:
         raise ValueError("[posterior.prior] is for jobs with a recording: an arm's impedance has none")
-    return Job(
-        {}, ModelSettings(arm=arm), window, trust=trust, posterior=posterior, trials=trials, folder=folder, text=text
-    )
+    return TrialsJob(trials, arm, trust, posterior, text)
 
 
 def posterior_settings(table: Any) -> PosteriorSettings:
@@ -314,7 +330,7 @@ def model_settings(table: Any) -> ModelSettings:
     return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)))
 
 
-def _check_values(job: Job) -> None:
+def _check_values(job: WindowJob) -> None:
     if job.model.human is None and job.model.robot is None and job.model.arm is None:
         raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
     both = job.model.human is not None and job.model.robot is not None
@@ -363,7 +379,7 @@ def _check_limits(trust: TrustLimits) -> None:
             raise ValueError(f"trust.{name} is {getattr(trust, name)}: it is a share, between 0 and 1")
 
 
-def _check_gears(job: Job) -> None:
+def _check_gears(job: WindowJob) -> None:
     """A gear counts once: either when the recording is read, or in the models, and there for both alike."""
     ratios = {part.gear_ratio for part in (job.model.robot, job.model.human) if part is not None}
     if len(ratios) > 1:

@@ -6,7 +6,7 @@ from jaximp.identification.check import Finding, Proposal, check_recording
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import Prepared, estimate
 from jaximp.identification.identify import prepare as prepare_recording
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.jobs.run_trials import ArmInference, TrialsResult, identify_trials, infer_trials
 from jaximp.posterior.inference import Inference, posterior_of
 from jaximp.types import Progress, Recording
@@ -19,19 +19,19 @@ def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimate
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
-    if job.trials is not None:
+    if isinstance(job, TrialsJob):
         return identify_trials(job, progress)
     return identify_recording(job, job.load(), job.load_robot_alone(), progress)
 
 
 def identify_recording(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> list[Estimates]:
     """As `identify`, for recordings that are in memory."""
     return estimate(job.pipeline_for(recording), recording, alone, progress)
 
 
-def prepare(job: Job, recording: Recording | None = None, alone: Recording | None = None) -> Prepared:
+def prepare(job: WindowJob, recording: Recording | None = None, alone: Recording | None = None) -> Prepared:
     """Read the recordings of a job (or take these) and filter them: rows for least squares, windows still to come."""
     if recording is None:
         recording, alone = job.load(), job.load_robot_alone()
@@ -39,7 +39,7 @@ def prepare(job: Job, recording: Recording | None = None, alone: Recording | Non
 
 
 def check(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> tuple[list[Finding], Proposal]:
     """Look at a recording for the model of a job, and propose cut-offs and a window."""
     return check_recording(job.pipeline_for(recording), recording, alone, progress)
@@ -51,13 +51,13 @@ def infer(job: Job, progress: Progress = lambda share: None) -> Inference | ArmI
     **Raises:** `ValueError` with one line that names the cause and the remedy: filters inside every window, parameters
     that the data leave undetermined, an impossible prior, an impedance without standard errors, and as `identify`.
     """
-    if job.trials is not None:
+    if isinstance(job, TrialsJob):
         return infer_trials(job, progress)
     return infer_recording(job, job.load(), job.load_robot_alone(), progress)
 
 
 def infer_recording(
-    job: Job, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
 ) -> Inference:
     """As `infer`, for recordings that are in memory."""
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import Job, TrialsJob
 from jaximp.numerics.precision import require_float64
 from jaximp.perturbation.deviations import KnownArm
 from jaximp.perturbation.impedance import ArmImpedance, identify_impedance
@@ -126,11 +126,10 @@ def identify_trials(job: Job, progress: Progress = lambda share: None) -> Trials
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
     require_float64()
-    trials = job.trials
-    if trials is None:
+    if not isinstance(job, TrialsJob):
         raise ValueError("this job has no [trials]: identify() is for recordings with windows")
     check_trials(job)
-    known = _Known(job)
+    trials, known = job.trials, _Known(job)
     progress(0.1)
     cutoff = None if trials.cutoff is None else np.array(trials.cutoff)
     read: dict[bool, tuple[Trials, Trials | None, tuple[str, ...]]] = {}
@@ -175,11 +174,9 @@ def infer_trials(job: Job, progress: Progress = lambda share: None) -> ArmInfere
     return ArmInference(result, derive(drawn, density.elements, density.element_names, density.element_units))
 
 
-def check_trials(job: Job) -> None:
+def check_trials(job: TrialsJob) -> None:
     """**Raises:** `ValueError` for a job whose trials cannot be identified."""
-    trials, arm = job.trials, job.model.arm
-    assert trials is not None
-    assert arm is not None
+    trials = job.trials
     for method in trials.methods:
         if method not in METHODS:
             raise ValueError(f"trials.method is '{method}': {nearest(method, list(METHODS))}")
@@ -188,7 +185,7 @@ def check_trials(job: Job) -> None:
             "a job of postures alone tells the inertia and no impedance in motion: put their file into "
             "[trials.posture] of the job with the movements"
         )
-    if arm.known_inertia is None and trials.posture is None:
+    if job.arm.known_inertia is None and trials.posture is None:
         raise ValueError(
             "the arm's inertia is not known: add [trials.posture] with trials of the static task, or "
             "model.arm.inertia = { upper_arm = I_1 + m_2 l1^2, forearm = I_2, coupling = m_2 c_2 l1 } in kg m^2"
@@ -198,10 +195,8 @@ def check_trials(job: Job) -> None:
 class _Known:
     """What a job knows of the arm, read once."""
 
-    def __init__(self, job: Job):
-        assert job.trials is not None
-        assert job.model.arm is not None
-        self._settings, self._handle = job.model.arm, job.trials.known_handle()
+    def __init__(self, job: TrialsJob):
+        self._settings, self._handle = job.arm, job.trials.known_handle()
         self._table = job.trials.posture
         self._found: dict[bool, StaticFit] = {}
         self.notes: tuple[str, ...] = ()

@@ -183,8 +183,8 @@ def run(swept: Sweep, progress: Progress = lambda share: None) -> Outcome:
     for cuff in swept.cuffs:
         arms, keys = cases(swept, cuff)
         for first in range(0, len(keys), together):
-            part = jax.tree.map(lambda x, first=first: x[first : first + together], (arms, keys))
-            parts.append(jax.tree.map(np.asarray, sweep(*part, jnp.asarray(swept.durations), inertia)))
+            some, their = jax.tree.map(lambda x, first=first: x[first : first + together], (arms, keys))
+            parts.append(jax.tree.map(np.asarray, sweep(some, their, jnp.asarray(swept.durations), inertia)))
             progress(len(parts) * together / math.prod(shape))
     return jax.tree.map(lambda *x: np.concatenate(x).reshape(shape + x[0].shape[1:]), *parts)
 

@@ -20,7 +20,7 @@ from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filter_settings import design_filters
 from jaximp.identification.misfit import SUSPECTS
 from jaximp.identification.separation import METHODS
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
 from jaximp.plots.wording import main_parameter, number, percent, pretty_unit, words
@@ -129,7 +129,7 @@ def write_results(
     folder: str | Path,
     estimates_list: Sequence[Estimates],
     lengths: Sequence[Estimates],
-    job: Job,
+    job: WindowJob,
     recording: Recording,
 ) -> None:
     """Write everything into an existing folder.
@@ -343,7 +343,7 @@ def _all_methods(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def summary(
-    estimates_list: Sequence[Estimates], job: Job, recording: Recording, lengths: Sequence[Estimates] = ()
+    estimates_list: Sequence[Estimates], job: WindowJob, recording: Recording, lengths: Sequence[Estimates] = ()
 ) -> dict[str, Any]:
     """Everything worth knowing, as plain dictionaries, lists, numbers and text; None where there is no number.
 
@@ -374,7 +374,7 @@ def summary(
     return without_nan(content)
 
 
-def estimates_table(estimates: Estimates | Sequence[Estimates], job: Job | None = None) -> pa.Table:
+def estimates_table(estimates: Estimates | Sequence[Estimates], job: WindowJob | None = None) -> pa.Table:
     """One row per window, of one recording or of several. A column's unit is its field's metadata `unit`; the job's
     text is in the schema's."""
     several = [estimates] if isinstance(estimates, Estimates) else estimates

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaximp import plots
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import TrialsJob
 from jaximp.jobs.run_trials import TrialsResult
 from jaximp.models.endpoint import Ellipse, ellipse, endpoint_damping, endpoint_stiffness, propagated_stderr
 from jaximp.models.inertia import BASE_INERTIA
@@ -83,7 +83,7 @@ def live_figures(result: TrialsResult) -> dict[str, Live]:
     }
 
 
-def write_trials_results(folder: str | Path, result: TrialsResult, job: Job) -> None:
+def write_trials_results(folder: str | Path, result: TrialsResult, job: TrialsJob) -> None:
     """Write `estimates.parquet`, `summary.json`, `report.html` and every figure as a PNG file into a folder."""
     folder, content = Path(folder), summary(result, job)
     write_table(folder / "estimates.parquet", estimates_table(result, job))
@@ -186,12 +186,11 @@ def _methods(content: dict[str, Any]) -> Table:
     return Table([*columns, Column("Why", "text")], rows, void)
 
 
-def summary(result: TrialsResult, job: Job) -> dict[str, Any]:
+def summary(result: TrialsResult, job: TrialsJob) -> dict[str, Any]:
     """Everything worth knowing, as plain dictionaries, lists, numbers and text; None where there is no number.
 
     The main method's results stand at the top level, those of further methods under `further_methods`.
     """
-    assert job.trials is not None
     handle = result.main.arm.handle
     content = {
         **_result(result.main),
@@ -252,7 +251,7 @@ def _in_plain_numbers(one: Ellipse) -> dict[str, float]:
     return {name: float(value) for name, value in vars(one).items()}
 
 
-def estimates_table(result: TrialsResult, job: Job | None = None) -> pa.Table:
+def estimates_table(result: TrialsResult, job: TrialsJob | None = None) -> pa.Table:
     """One row per method. A column's unit is its field's metadata `unit`; the job's text is in the schema's."""
     columns = [
         (same[0].name, same[0].unit, [column.values for column in same])
@@ -319,9 +318,8 @@ def _windows(result: TrialsResult) -> list[dict[str, Any]]:
     ]
 
 
-def _name(job: Job) -> str:
+def _name(job: TrialsJob) -> str:
     """What the recordings are called."""
-    assert job.trials is not None
     if job.trials.file is not None:
         return job.trials.file
     files = job.trials.files

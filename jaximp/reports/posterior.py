@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximp import plots
-from jaximp.jobs.job import Job
+from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.jobs.run_trials import ArmInference
 from jaximp.least_squares.noise import ATTENUATION
 from jaximp.plots.wording import pretty_unit, words
@@ -95,7 +95,7 @@ def _rises(probability: Mapping[str, float]) -> str:
     return f"Greater than in the window before, with probability: {', '.join(known)}." if known else ""
 
 
-def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> dict[str, Any]:
+def write_posterior_results(folder: str | Path, found: Inference, job: WindowJob) -> dict[str, Any]:
     """Write `posterior.nc` (whole record), `windows.nc`, `summary.json`, `report.html` and the figures.
 
     **Returns:** the summary.
@@ -121,7 +121,7 @@ def write_posterior_results(folder: str | Path, found: Inference, job: Job) -> d
     return _write(folder, content, figures, live_figures(found, shown, changes))
 
 
-def write_arm_posterior(folder: str | Path, inference: ArmInference, job: Job) -> dict[str, Any]:
+def write_arm_posterior(folder: str | Path, inference: ArmInference, job: TrialsJob) -> dict[str, Any]:
     """The same for an arm's damping and stiffness from perturbed movements."""
     folder, posterior, found = Path(folder), inference.posterior, inference.identified
     save_posterior(folder / "posterior.nc", posterior)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,11 +81,12 @@ def test_bad_manifests_are_refused(tmp_path: Path, manifest: str, why: str) -> N
         batch.run(parse_job(JOB), out=tmp_path / "out", manifest=tmp_path / "study.csv")
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_a_job_with_trials_is_refused() -> None:
-    job = replace(parse_job(JOB), trials="anything")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="trials"):
-        make_plan(job, [])
+def test_a_job_with_trials_is_refused(tmp_path: Path) -> None:
+    columns = "time = 't'\nposition = ['x', 'y']\ntorque = ['fx', 'fy']"
+    job = parse_job(f"[trials]\nfile = 't.csv'\n{columns}\n[model.arm]\nlengths = [0.3, 0.3]\n", tmp_path)
+    with pytest.raises(ValueError, match=r"with \[trials\] is one study by itself: batch works on jobs with"):
+        batch.run(job, [tmp_path], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_manifests_are_what_spreadsheets_write(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from scipy.signal import sosfiltfilt
 from jaximp.identification import FilterSettings, WindowSettings
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
-from jaximp.jobs import HumanSettings, Job, ModelSettings, RobotSettings
+from jaximp.jobs import HumanSettings, ModelSettings, RobotSettings, WindowJob
 from jaximp.models import Model
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.signals import differentiate
@@ -29,9 +29,9 @@ def recording(n_joints: int) -> Recording:
     return recording_from_arrays(time, q, torque)
 
 
-def job(step: float, **filters: float | int | str | None) -> Job:
+def job(step: float, **filters: float | int | str | None) -> WindowJob:
     settings: dict[str, Any] = {"position_cutoff": 60.0, "position_order": 8, "decimation_cutoff": 20.0} | filters
-    return Job(
+    return WindowJob(
         recording={},
         model=ModelSettings(HumanSettings(offset="high_pass" not in filters), RobotSettings()),
         window=WindowSettings(0.3, step, min_velocity=0.5),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaximp.jobs.job import Job, parse_job
+from jaximp.jobs.job import Job, TrialsJob, parse_job
 
 JOB = """
 [trials]
@@ -24,11 +24,10 @@ lengths = [0.29, 0.34]
 
 def test_a_job_of_trials_has_defaults() -> None:
     job = parse_job(JOB)
-    assert job.trials is not None
-    assert (job.trials.task, job.trials.window, job.window.length) == ("movement", 0.115, 0.115)
+    assert isinstance(job, TrialsJob)
+    assert (job.trials.task, job.trials.window) == ("movement", 0.115)
     assert job.trials.handle is None
-    assert job.model.arm is not None
-    assert job.model.arm.geometry().lengths == (0.29, 0.34)
+    assert job.arm.geometry().lengths == (0.29, 0.34)
     with pytest.raises(ValueError, match=r"this job has .trials. and no .recording."):
         job.load()
 
@@ -39,9 +38,9 @@ def test_a_job_of_trials_has_settings() -> None:
                        "[model.arm]\nshoulder = [0.1, -0.2]\n"
                        "inertia = { upper_arm = 0.2, forearm = 0.07, coupling = 0.08 }\n"
                        "inertia_stderr = { upper_arm = 0.01, forearm = 0.02, coupling = 0.03 }")  # fmt: skip
-    trials, arm = parse_job(text).trials, parse_job(text).model.arm
-    assert trials is not None
-    assert arm is not None
+    job = parse_job(text)
+    assert isinstance(job, TrialsJob)
+    trials, arm = job.trials, job.arm
     assert trials.handle is not None
     assert (trials.cutoff, trials.handle.mass, trials.method) == ([2.0, 30.0], [4.0, 6.0], "gomi_kawato")
     assert trials.trigger is not None
@@ -142,7 +141,7 @@ def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
     for files, message in {"*.csv": "no file matches", "empty": "has no file of a known kind"}.items():
         with pytest.raises(ValueError, match=message):
             job(files).files()
-    missing = job("none.csv").trials
-    assert missing is not None
+    missing = job("none.csv")
+    assert isinstance(missing, TrialsJob)
     with pytest.raises(FileNotFoundError, match="there is no such file"):
-        missing.load()
+        missing.trials.load()
