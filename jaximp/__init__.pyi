@@ -33,11 +33,11 @@ from .perturbation.impedance import ArmImpedance as ArmImpedance
 from .perturbation.impedance import identify_impedance as identify_impedance
 from .perturbation.stiffness import fit_stiffness as fit_stiffness
 from .posterior.draws import Posterior as Posterior
+from .posterior.ensemble import sample_posterior as sample_posterior
 from .posterior.files import load_posterior as load_posterior
 from .posterior.files import save_posterior as save_posterior
 from .posterior.inference import Inference as Inference
 from .posterior.inference import compare_models as compare_models
-from .posterior.samplers import sample_posterior as sample_posterior
 from .recordings.load import load_recording as load_recording
 from .recordings.load import recording_from_arrays as recording_from_arrays
 from .recordings.save import save_recording as save_recording

@@ -19,7 +19,7 @@ from jaximp.perturbation.trials import Trials
 from jaximp.perturbation.window_lengths import OtherWindows, at_other_windows
 from jaximp.posterior.densities import estimate_density
 from jaximp.posterior.draws import Posterior, credible_interval, derive
-from jaximp.posterior.samplers import sample_posterior
+from jaximp.posterior.ensemble import sample_posterior
 from jaximp.results import Column, Result
 from jaximp.trust.verdicts import TRUSTED, UNCONVERGED
 from jaximp.types import Numbers, Progress, nearest

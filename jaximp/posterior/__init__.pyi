@@ -11,9 +11,11 @@ from .draws import derive as derive
 from .draws import exact_posterior as exact_posterior
 from .draws import probability_greater as probability_greater
 from .draws import summarise as summarise
+from .ensemble import sample_posterior as sample_posterior
 from .files import load_posterior as load_posterior
 from .files import save_posterior as save_posterior
 from .files import to_inference_data as to_inference_data
+from .hamiltonian import sample_many as sample_many
 from .inference import Inference as Inference
 from .inference import PosteriorSettings as PosteriorSettings
 from .inference import compare_models as compare_models
@@ -28,5 +30,3 @@ from .priors import MultivariateNormal as MultivariateNormal
 from .priors import Normal as Normal
 from .priors import Prior as Prior
 from .priors import make_prior as make_prior
-from .samplers import sample_many as sample_many
-from .samplers import sample_posterior as sample_posterior

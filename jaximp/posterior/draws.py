@@ -2,8 +2,8 @@
 
 A log density is any callable of parameters (p,), written in JAX, whose value is the logarithm of the posterior density
 up to a constant, -inf outside its support. It may know its `names` and `units`, and with `laplace()` where its mode is
-and the covariance there. `jaximp.samplers` draws from it. Where the model is linear and the noise Gaussian no sampler
-is needed: `exact_posterior`.
+and the covariance there. `ensemble` and `hamiltonian` draw from it. Where the model is linear and the noise Gaussian
+no sampler is needed: `exact_posterior`.
 """
 
 from __future__ import annotations
@@ -205,6 +205,11 @@ def labels(
     if len(set(names)) < p:
         raise ValueError(f"parameters share a name: {', '.join(names)}; give each its own")
     return names, units
+
+
+def numbers_apart(log_density: Any) -> tuple[Any, Any]:
+    """Its arrays, and all else: log densities that differ in their numbers only share compiled code."""
+    return eqx.partition(log_density, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
 
 
 def index_of(names: Sequence[str], name: str) -> int:

@@ -53,9 +53,10 @@ from jaximp.posterior.draws import (
     probability_greater,
     stacked,
 )
+from jaximp.posterior.ensemble import sample_posterior
+from jaximp.posterior.hamiltonian import sample_many
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
-from jaximp.posterior.samplers import sample_many, sample_posterior
 from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import POOR, TRUSTED, UNCONVERGED, WEAK, Rule, Verdict, Verdicts, judge_one

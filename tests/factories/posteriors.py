@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaximp.posterior.draws import Posterior, effective_samples, exact_posterior
-from jaximp.posterior.samplers import sample_posterior
+from jaximp.posterior.ensemble import sample_posterior
 
 
 class Linear(eqx.Module):

@@ -65,8 +65,8 @@ def test_a_run_that_is_killed_resumes(tmp_path: Path) -> None:
         sys.path[:0] = {path!r}
         import jax
         jax.config.update("jax_enable_x64", True)
-        from jaximp.posterior import samplers
-        samplers.SAVE_EVERY = 0
+        from jaximp.posterior import ensemble
+        ensemble.SAVE_EVERY = 0
         from factories.posteriors import chain_run
         from pathlib import Path
         chain_run(Path({file!r}), ess=1e6)

@@ -18,8 +18,9 @@ from factories.posteriors import Linear, means_agree, mode_of, triangle_of, vari
 from jaximp import plots
 from jaximp.posterior import files as posterior_files
 from jaximp.posterior.draws import Posterior, PosteriorMany, derive, exact_posterior
+from jaximp.posterior.ensemble import sample_posterior
 from jaximp.posterior.files import load_posterior, save_posterior
-from jaximp.posterior.samplers import sample_many, sample_posterior
+from jaximp.posterior.hamiltonian import sample_many
 
 EIGHT = ("D11", "D12", "D21", "D22", "l11", "l21", "l22", "log_noise")
 
