@@ -25,8 +25,10 @@ from jaximp.identification.regression import Rows, first_call, on_every_device
 from jaximp.identification.whitening import White, from_white
 from jaximp.least_squares.chunks import LONGEST_REACH, finish
 from jaximp.least_squares.chunks import Task as ChunkTask
-from jaximp.least_squares.engine import BLOCK, FEWEST_LANES, ChunkFit, Plan, solve_chunk
+from jaximp.least_squares.engine import solve_chunk
+from jaximp.least_squares.fits import ChunkFit
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares, window_starts
+from jaximp.least_squares.sums import BLOCK, FEWEST_LANES, Plan
 from jaximp.least_squares.window import SlidingFit, check_finite, variance_accounted_for
 from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray

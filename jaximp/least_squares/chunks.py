@@ -22,16 +22,9 @@ from jax import lax
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaximp.least_squares.engine import (
-    BLOCK,
-    FEWEST_LANES,
-    ChunkFit,
-    Plan,
-    Statistics,
-    Wanted,
-    solve_chunk,
-    solve_shortest,
-)
+from jaximp.least_squares.engine import Wanted, solve_chunk, solve_shortest
+from jaximp.least_squares.fits import ChunkFit, Statistics
+from jaximp.least_squares.sums import BLOCK, FEWEST_LANES, Plan
 from jaximp.least_squares.window import SlidingFit, WindowFit, solve_window
 from jaximp.numerics.compilation import compiled, is_traced
 from jaximp.numerics.linear_algebra import root
