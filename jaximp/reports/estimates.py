@@ -97,7 +97,7 @@ TITLES = {
 
 def live_figures(estimates: Estimates) -> dict[str, Live]:
     """What a reader can zoom and ask. Figures know no `Estimates`: what they need of it is read here alone."""
-    from jaximp.plots.interactive import Quality, Torque, Windows, over_time
+    from jaximp.plots.interactive_windows import Quality, Torque, Windows, over_time
 
     shown, fit, verdicts = estimates.summarised(), estimates.fit, estimates.verdicts
     value = np.asarray(shown.fit.theta)

@@ -72,14 +72,14 @@ CAPTIONS = {
 
 def live_figures(result: TrialsResult) -> dict[str, Live]:
     """What a reader can zoom and ask. Figures know no `ArmImpedance`: what they need of it is read here alone."""
-    from jaximp.plots import interactive
+    from jaximp.plots import interactive_arm
 
     main = result.main
     position, force = np.asarray(main.curves.deviations.position), np.asarray(main.curves.deviations.force)
     hands = {METHODS[one.method].short: one.at_hand for one in result.estimates}
     return {
-        "deviations": interactive.deviations(position, force, main.curves.sample_rate),
-        "ellipses": interactive.ellipses(main.arm.geometry, main.angles, hands),
+        "deviations": interactive_arm.deviations(position, force, main.curves.sample_rate),
+        "ellipses": interactive_arm.ellipses(main.arm.geometry, main.angles, hands),
     }
 
 

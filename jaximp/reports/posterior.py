@@ -64,7 +64,7 @@ CORNER = 12
 
 def live_figures(found: Inference, shown: Sequence[str], changes: Sequence[dict[str, Any]]) -> dict[str, Live]:
     """What a reader can zoom and ask. Figures know no `Inference`: what they need of it is read here alone."""
-    from jaximp.plots.interactive import Torque, Windows, over_time
+    from jaximp.plots.interactive_windows import Torque, Windows, over_time
 
     windows = found.summarised[1]
     if windows is None or not len(found.end):

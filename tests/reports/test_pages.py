@@ -22,8 +22,8 @@ from jaximp import plots
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
 from jaximp.models import ArmGeometry, endpoint_impedance
-from jaximp.plots import interactive
-from jaximp.plots.interactive import Torque, Windows, over_time
+from jaximp.plots import interactive, interactive_arm, interactive_windows
+from jaximp.plots.interactive_windows import Torque, Windows, over_time
 from jaximp.reports import estimates as report
 from jaximp.reports.pages import Alert, Column, Figure, Listing, Page, Prose, Section, Table, html
 from jaximp.trust.verdicts import POOR, TRUSTED
@@ -165,9 +165,9 @@ def test_five_minutes_at_a_kilohertz_stay_below_three_megabytes() -> None:
 
 def test_bands_have_gaps_where_nothing_is_known() -> None:
     """Canvas areas bridge what is no number: there the band must have no height."""
-    plot = interactive._plot(100, interactive.Range1d(0, 9), interactive.Range1d(0, 9), "y")
+    plot = interactive.empty_panel(100, interactive_windows.Range1d(0, 9), interactive_windows.Range1d(0, 9), "y")
     low = np.array([1, 1, np.nan, np.nan, 2, 2, np.nan, 3.0])
-    interactive._band(plot, np.arange(8.0), low, low + 1)
+    interactive_windows._band(plot, np.arange(8.0), low, low + 1)
     data = plot.renderers[0].data_source.data
     np.testing.assert_array_equal(data["x"], [0, 0, 1, 1, 4, 4, 5, 5, 7, 7, 7])
     np.testing.assert_array_equal(data["high"] - data["low"], [0, 1, 1, 0, 0, 1, 1, 0, 0, 1, 0])
@@ -190,7 +190,7 @@ def test_ellipses_have_axes_of_one_scale_and_leave_out_what_is_unknown() -> None
     xi, D, K = np.array([0.268, 0.084, 0.074]), np.array([[2.4, 1.2], [1.2, 1.4]]), np.array([[29, 14], [14, 17.0]])
     found = endpoint_impedance(geometry, q, xi, D, K)
     unknown = endpoint_impedance(geometry, q, xi, D, K * np.nan)
-    live = interactive.ellipses(geometry, q, {HOSTILE[0]: found, "unknown": unknown})
+    live = interactive_arm.ellipses(geometry, q, {HOSTILE[0]: found, "unknown": unknown})
     panels = [plot for plot, _, _ in live.root.children]
     assert all(plot.match_aspect for plot in panels)
     assert [len(plot.hover) for plot in panels] == [2, 2, 1]
@@ -402,7 +402,7 @@ def test_hostile_texts_do_nothing_in_a_browser(running: Browser, tmp_path: Path)
 def test_a_trial_can_be_picked_among_deviations(running: Browser, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     position, force = rng.normal(size=(2, 6, 40, 2)).cumsum(axis=2)
-    live = {"deviations": interactive.deviations(1e-3 * position, force, 1000.0)}
+    live = {"deviations": interactive_arm.deviations(1e-3 * position, force, 1000.0)}
     path = tmp_path / "page.html"
     path.write_text(html(page_of(live)), encoding="utf-8")
     visit(running, path)
