@@ -29,22 +29,20 @@ import pyarrow.parquet as pq
 from jaximp.batch.overview import Series, thinned, write_overview
 from jaximp.batch.plan import LOG, Batch, Item, Plan, find_items, make_plan, of_recordings
 from jaximp.batch.results import (
-    RUN_COLUMNS,
     UNFINISHED,
     Interrupted,
-    Task,
     earlier_inputs,
     finished,
-    load,
     receipt_path,
     report_folder,
     report_holds,
     report_wanted,
-    reserved_columns,
     solve_batch,
     write_late_report,
     write_whole,
 )
+from jaximp.batch.tables import RUN_COLUMNS, reserved_columns
+from jaximp.batch.task import Task, load
 from jaximp.jobs.job import Job, WindowJob
 from jaximp.least_squares.chunks import cores
 from jaximp.numerics.precision import require_float64

@@ -15,6 +15,7 @@ from factories.studies import JOB, LENGTHS, beside, joint, still
 from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
+from jaximp.batch import tables as batch_tables
 from jaximp.batch.plan import find_items, make_plan
 from jaximp.jobs.job import parse_job, read_job
 from jaximp.jobs.run import identify_recording
@@ -100,7 +101,7 @@ def test_a_study_has_conditions_of_its_own(tmp_path: Path) -> None:
     assert set(table["condition"].to_pylist()) == {"tense"}
     expected = identify_recording(job, joint(1000))[0]
     np.testing.assert_allclose(table["condition_number"], expected.fit.cond, 1e-6)
-    assert {*table.column_names} - {"condition"} <= batch_results.reserved_columns(job)
+    assert {*table.column_names} - {"condition"} <= batch_tables.reserved_columns(job)
 
 
 @pytest.mark.slow

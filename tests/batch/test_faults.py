@@ -21,6 +21,8 @@ import pytest
 from factories.studies import JOB, LENGTHS, content, joint, run
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
+from jaximp.batch import tables as batch_tables
+from jaximp.batch import task as batch_task
 from jaximp.batch.plan import find_items
 from jaximp.identification.identify import Prepared
 from jaximp.jobs.job import parse_job
@@ -237,7 +239,7 @@ def test_a_name_that_is_no_text_can_be_told(tmp_path: Path) -> None:
     assert [item.name for item in items] == ["r\\udcff.parquet"]
     told = batch_results.failure(items[0], "damaged")
     assert json.dumps(told).encode("ascii")
-    assert batch_results._texts([str(items[0].file)]).to_pylist() == [told["file"]]
+    assert batch_tables._texts([str(items[0].file)]).to_pylist() == [told["file"]]
 
 
 def test_a_second_resume_does_nothing_again(study: Path, tmp_path: Path) -> None:
@@ -289,7 +291,7 @@ def test_a_recording_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatc
     with h5py.File(tmp_path / "huge.h5", "w") as file:
         for name in ("time_s", "position_rad", "torque_Nm"):
             file.create_dataset(name, (10**12,), chunks=(1000,), dtype="f8")
-    monkeypatch.setattr(batch_results, "recording_from_mapping", lambda *args: pytest.fail("it was read"))
+    monkeypatch.setattr(batch_task, "recording_from_mapping", lambda *args: pytest.fail("it was read"))
     outcome = batch.run(parse_job(JOB, tmp_path), [tmp_path], tmp_path / "out")
     assert "claims 1e+12 samples" in outcome.failed[0]["reason"]
 

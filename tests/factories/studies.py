@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from factories import joints
-from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
+from jaximp.batch import tables as batch_tables
 from jaximp.jobs.job import read_job
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.types import Recording
@@ -72,7 +72,7 @@ def content(out: Path) -> dict[str, object]:
         if not path.is_file() or name.startswith(("receipts/", "batch.log", ".jaximp")):
             continue
         if name.startswith("recordings/"):
-            found[name] = pq.ParquetFile(path).read().drop_columns(list(batch_results.RUN_COLUMNS))
+            found[name] = pq.ParquetFile(path).read().drop_columns(list(batch_tables.RUN_COLUMNS))
         else:
             found[name] = path.read_bytes()
     return found
