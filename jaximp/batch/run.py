@@ -83,6 +83,8 @@ class Outcome:
     recordings: int = 0
     windows: int = 0
     trusted: int = 0
+    done: int = 0
+    """Recordings whose batch is finished, by this run or an earlier one."""
     skipped: int = 0
     """Recordings that an earlier run had done."""
     outdated: int = 0
@@ -155,46 +157,54 @@ def run_plan(
     with _log(out, tell) as log, _signals_heard() as check:
         log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
         left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
-        done = outcome.skipped
-        begin = time.perf_counter()
         try:
-            for batch, found in _solved(task, left, workers, scheduler, check):
-                if isinstance(found, BaseException):
-                    why = f"{type(found).__name__}: {' '.join(str(found).split())}"
-                    outcome.broken.append(f"batch {batch.number}: {why}")
-                    log({"event": "broken", "batch": batch.number, "reason": why})
-                    continue
-                _take_up(outcome, found)
-                done += len(batch.items)
-                for failed in found["failed"]:
-                    log({"event": "failed", **failed})
-                for name, why in found["run"]["without_report"].items():
-                    log({"event": "no report", "recording": name, "reason": why})
-                rate = (done - outcome.skipped) / max(time.perf_counter() - begin, 1e-9)
-                log(
-                    {"event": "batch", "batch": batch.number, "done": done, "of": len(plan.items),
-                     "failed": len(outcome.failed), "per_second": rate}
-                )  # fmt: skip
+            _follow(_solved(task, left, workers, scheduler, check), outcome, log)
             check()
         except (KeyboardInterrupt, SystemExit):
-            log({"event": "interrupted", "done": done, "of": len(plan.items)})
+            log({"event": "interrupted", "done": outcome.done, "of": outcome.recordings})
             raise
         outcome.failed.sort(key=lambda failed: str(failed["recording"]))
         write_whole(out / "quarantine.json", (json.dumps(outcome.failed, indent=1) + "\n").encode())
-        try:
-            if len(outcome.broken) < len(plan.batches):
-                earlier = {item for batch in {*plan.batches} - {*left} for item in batch.items}
-                _write_late_reports(task, sorted(earlier, key=lambda item: item.name), log)
-                outcome.odd = write_page(out, plan.metadata, plan.partitions)
-                for name, why in outcome.odd.items():
-                    log({"event": "odd", "recording": name, "reason": why})
-        except OSError as error:
-            outcome.broken.append(f"{PAGE}: {error.strerror or error}")
+        if len(outcome.broken) < len(plan.batches):
+            earlier = {item for batch in {*plan.batches} - {*left} for item in batch.items}
+            _write_pages(task, plan, sorted(earlier, key=lambda item: item.name), outcome, log)
         log(
             {"event": "done", "recordings": outcome.recordings, "windows": outcome.windows, "trusted": outcome.trusted,
              "failed": len(outcome.failed), "skipped": outcome.skipped, "broken": len(outcome.broken)}
         )  # fmt: skip
     return outcome
+
+
+def _follow(solved: Found, outcome: Outcome, log: Tell) -> None:
+    """Take up what becomes of each batch, and say it."""
+    begin = time.perf_counter()
+    for batch, found in solved:
+        if isinstance(found, BaseException):
+            why = f"{type(found).__name__}: {' '.join(str(found).split())}"
+            outcome.broken.append(f"batch {batch.number}: {why}")
+            log({"event": "broken", "batch": batch.number, "reason": why})
+            continue
+        _take_up(outcome, found)
+        for failed in found["failed"]:
+            log({"event": "failed", **failed})
+        for name, why in found["run"]["without_report"].items():
+            log({"event": "no report", "recording": name, "reason": why})
+        rate = (outcome.done - outcome.skipped) / max(time.perf_counter() - begin, 1e-9)
+        log(
+            {"event": "batch", "batch": batch.number, "done": outcome.done, "of": outcome.recordings,
+             "failed": len(outcome.failed), "per_second": rate}
+        )  # fmt: skip
+
+
+def _write_pages(task: Task, plan: Plan, earlier: Sequence[Item], outcome: Outcome, log: Tell) -> None:
+    """Reports that are asked for late, of recordings that were done earlier, and the overview."""
+    try:
+        _write_late_reports(task, earlier, log)
+        outcome.odd = write_page(task.out, plan.metadata, plan.partitions)
+        for name, why in outcome.odd.items():
+            log({"event": "odd", "recording": name, "reason": why})
+    except OSError as error:
+        outcome.broken.append(f"{PAGE}: {error.strerror or error}")
 
 
 def _checked_reports(reports: str | Sequence[str], plan: Plan) -> str | tuple[str, ...]:
@@ -229,6 +239,7 @@ def first_trouble(job: WindowJob, plan: Plan) -> str:
 
 
 def _take_up(outcome: Outcome, receipt: dict[str, Any]) -> None:
+    outcome.done += len(receipt["inputs"])
     outcome.failed += receipt["failed"]
     outcome.windows += receipt["windows"]
     outcome.trusted += receipt["trusted"]
