@@ -184,7 +184,7 @@ def _follow(solved: Found, outcome: Outcome, log: Tell) -> None:
             outcome.broken.append(f"batch {batch.number}: {why}")
             log({"event": "broken", "batch": batch.number, "reason": why})
             continue
-        _take_up(outcome, found)
+        _take_up(outcome, batch, found)
         for failed in found["failed"]:
             log({"event": "failed", **failed})
         for name, why in found["run"]["without_report"].items():
@@ -238,8 +238,8 @@ def first_trouble(job: WindowJob, plan: Plan) -> str:
     return ""
 
 
-def _take_up(outcome: Outcome, receipt: dict[str, Any]) -> None:
-    outcome.done += len(receipt["inputs"])
+def _take_up(outcome: Outcome, batch: Batch, receipt: dict[str, Any]) -> None:
+    outcome.done += len(batch.items)
     outcome.failed += receipt["failed"]
     outcome.windows += receipt["windows"]
     outcome.trusted += receipt["trusted"]
@@ -281,7 +281,7 @@ def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
                     shutil.rmtree(folder, ignore_errors=True)
             continue
         kept |= {receipt_path(task.out, batch), *(task.out / name for name in receipt["outputs"])}
-        _take_up(outcome, receipt)
+        _take_up(outcome, batch, receipt)
         outcome.skipped += len(batch.items)
     for folder in task.out.iterdir():
         if folder.is_symlink() or not folder.is_dir() or not re.fullmatch(FOLDERS, folder.name):
