@@ -17,8 +17,6 @@ from .run import identify_recording as identify_recording
 from .run import infer as infer
 from .run import infer_recording as infer_recording
 from .run import prepare as prepare
-from .run_trials import ArmInference as ArmInference
-from .run_trials import TrialsResult as TrialsResult
 from .run_trials import identify_trials as identify_trials
 from .run_trials import infer_trials as infer_trials
 from .trials import TrialsSettings as TrialsSettings

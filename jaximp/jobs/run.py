@@ -7,7 +7,9 @@ from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import Prepared, estimate
 from jaximp.identification.identify import prepare as prepare_recording
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
-from jaximp.jobs.run_trials import ArmInference, TrialsResult, identify_trials, infer_trials
+from jaximp.jobs.run_trials import identify_trials, infer_trials
+from jaximp.perturbation.trials_result import TrialsResult
+from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.inference import Inference, posterior_of
 from jaximp.types import Progress, Recording
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,108 +15,13 @@ from jaximp.perturbation.isolation.feedback_jerk import energy_spectra
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.static import StaticFit, static_inertia
 from jaximp.perturbation.trials import Trials
-from jaximp.perturbation.window_lengths import OtherWindows, at_other_windows
+from jaximp.perturbation.trials_result import TrialsResult
+from jaximp.perturbation.window_lengths import at_other_windows
+from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.densities import estimate_density
-from jaximp.posterior.draws import Posterior, credible_interval, derive
+from jaximp.posterior.draws import derive
 from jaximp.posterior.ensemble import sample_posterior
-from jaximp.results import Column, Result
-from jaximp.trust.verdicts import TRUSTED, UNCONVERGED
-from jaximp.types import Numbers, Progress, nearest
-
-
-@dataclass(frozen=True)
-class TrialsResult:
-    """What a job with `[trials]` gives."""
-
-    estimates: tuple[ArmImpedance, ...]
-    """By every method that was asked for, the main one first."""
-    windows: OtherWindows | None
-    """By the main method, from other windows."""
-    spectra: tuple[Numbers, Numbers, Numbers] | None
-    """Of the jerk, where there are unperturbed trials: `energy_spectra`."""
-    static: StaticFit | None
-    """What `[trials.posture]` tells."""
-    postures: int = 0
-    """Trials of it."""
-    notes: tuple[str, ...] = ()
-    """What reading the trials says."""
-
-    @property
-    def main(self) -> ArmImpedance:
-        return self.estimates[0]
-
-    def __len__(self) -> int:
-        return len(self.estimates)
-
-    def __getitem__(self, k: int) -> ArmImpedance:
-        """By the k-th method."""
-        return self.estimates[k]
-
-    def __iter__(self) -> Iterator[ArmImpedance]:
-        return iter(self.estimates)
-
-
-@dataclass(frozen=True)
-class ArmInference(Result):
-    """An arm's impedance in draws around its main estimate."""
-
-    identified: TrialsResult
-    """What the draws stand around."""
-    posterior: Posterior
-    """Of damping, stiffness and all that follows from them."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.posterior.names
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return self.posterior.units
-
-    @property
-    def value(self) -> Numbers:
-        """(p,) means of the draws."""
-        return self.posterior.mean
-
-    @property
-    def stderr(self) -> Numbers:
-        """(p,) standard deviations of the draws."""
-        return np.sqrt(np.diagonal(self.posterior.covariance))
-
-    @property
-    def covariance(self) -> Numbers:
-        """(p, p) of the draws."""
-        return self.posterior.covariance
-
-    @property
-    def dof(self) -> float:
-        """Intervals are quantiles of the draws: no distribution is assumed."""
-        return np.inf
-
-    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
-        """(p,) lower and upper ends of credible intervals, with equal probability on both sides."""
-        return credible_interval(self.posterior.samples, level)
-
-    @property
-    def why(self) -> str:
-        """Why the draws, or the estimate that they stand around, cannot be trusted; empty where they can."""
-        found = self.identified.main
-        return self.posterior.why or ("" if found.verdict == TRUSTED else f"{found.verdict}: {found.reason}")
-
-    @property
-    def trusted(self) -> bool:
-        """Whether nothing speaks against the draws, see `why`."""
-        return not self.why
-
-    def columns(self) -> list[Column]:
-        """One row: mean and standard deviation of the draws, verdict and reason."""
-        columns = [
-            Column(f"{name}{tail}", unit, number)
-            for name, unit, *numbers in zip(self.names, self.units, self.value, self.stderr, strict=True)
-            for tail, number in zip(("", "_stderr"), numbers, strict=True)
-        ]
-        verdict = self.identified.main.verdict if not self.posterior.why else UNCONVERGED
-        return [*columns, Column("verdict", "", verdict), Column("reason", "", self.why)]
+from jaximp.types import Progress, nearest
 
 
 def identify_trials(job: Job, progress: Progress = lambda share: None) -> TrialsResult:

@@ -28,4 +28,5 @@ from .stiffness import merge_triangles as merge_triangles
 from .stiffness import residual_triangle as residual_triangle
 from .trials import Handle as Handle
 from .trials import Trials as Trials
+from .trials_result import TrialsResult as TrialsResult
 from .window_lengths import at_other_windows as at_other_windows

@@ -9,13 +9,14 @@ from matplotlib.figure import Figure
 
 from jaximp.design.excitation import Design
 from jaximp.identification.estimates import Estimates
-from jaximp.jobs.run_trials import ArmInference, TrialsResult
 from jaximp.perturbation.impedance import ArmImpedance
+from jaximp.perturbation.trials_result import TrialsResult
 from jaximp.plots.arm import ellipses
 from jaximp.plots.estimates import parameters_over_time
 from jaximp.plots.excitation import design
 from jaximp.plots.impedance import impedance_methods
 from jaximp.plots.posterior import bands, corner
+from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.draws import Posterior
 from jaximp.posterior.inference import Inference
 

@@ -1,3 +1,4 @@
+from .arm import ArmInference as ArmInference
 from .densities import Density as Density
 from .densities import adjusted as adjusted
 from .densities import estimate_density as estimate_density

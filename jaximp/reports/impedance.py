@@ -13,13 +13,13 @@ from jaxtyping import Array
 
 from jaximp import plots
 from jaximp.jobs.job import TrialsJob
-from jaximp.jobs.run_trials import TrialsResult
 from jaximp.models.endpoint import Ellipse, ellipse, endpoint_damping, endpoint_stiffness, propagated_stderr
 from jaximp.models.inertia import BASE_INERTIA
 from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.isolation.output_error import MISFIT
 from jaximp.perturbation.stiffness import MATRICES, MATRIX_OF
+from jaximp.perturbation.trials_result import TrialsResult
 from jaximp.plots.wording import number, percent, pretty_unit
 from jaximp.reports.pages import (
     Alert,

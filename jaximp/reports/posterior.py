@@ -10,9 +10,9 @@ import numpy as np
 
 from jaximp import plots
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
-from jaximp.jobs.run_trials import ArmInference
 from jaximp.least_squares.noise import ATTENUATION
 from jaximp.plots.wording import pretty_unit, words
+from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.densities import stiffness_matrices
 from jaximp.posterior.draws import Posterior, summarise
 from jaximp.posterior.files import save_posterior

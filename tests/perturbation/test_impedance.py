@@ -18,7 +18,7 @@ import pytest
 from command_line import jaximp
 from jaximp.jobs.job import parse_job, read_job
 from jaximp.jobs.run import infer
-from jaximp.jobs.run_trials import ArmInference, identify_trials
+from jaximp.jobs.run_trials import identify_trials
 from jaximp.models import BASE_INERTIA, ArmGeometry, PlanarArm
 from jaximp.perturbation import trial_fits as fit
 from jaximp.perturbation.deviations import Deviations, JointDeviations, KnownArm
@@ -29,6 +29,7 @@ from jaximp.perturbation.isolation.methods import METHODS, Method
 from jaximp.perturbation.sensors import handle_disagreement
 from jaximp.perturbation.trials import Handle, Trials
 from jaximp.perturbation.window_lengths import at_other_windows
+from jaximp.posterior.arm import ArmInference
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK
 
