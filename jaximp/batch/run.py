@@ -44,7 +44,7 @@ from jaximp.batch.results import (
 from jaximp.batch.tables import RUN_COLUMNS, reserved_columns
 from jaximp.batch.task import Task, load
 from jaximp.jobs.job import Job, WindowJob
-from jaximp.least_squares.chunks import cores
+from jaximp.numerics.cores import cores
 from jaximp.numerics.precision import require_float64
 from jaximp.plots.wording import main_parameter
 from jaximp.recordings.outputs import MARK

@@ -28,9 +28,9 @@ from jaxtyping import Array
 
 from jaximp.design.bounds import condition_bound
 from jaximp.design.objectives import log_condition, log_sigma_min, log_stderr, log_volume
-from jaximp.least_squares.chunks import cores
 from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries, at_rest, jerk
+from jaximp.numerics.cores import cores
 from jaximp.numerics.optimise import METHODS, minimise, onto_polytope
 from jaximp.numerics.precision import require_float64
 from jaximp.signals.derivatives import central_differences

@@ -6,7 +6,6 @@ read piece by piece gives the same numbers, to the last bit, as one that lies in
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -27,6 +26,7 @@ from jaximp.least_squares.fits import ChunkFit, Statistics
 from jaximp.least_squares.sums import BLOCK, FEWEST_LANES, Plan
 from jaximp.least_squares.window import SlidingFit, WindowFit, solve_window
 from jaximp.numerics.compilation import compiled, is_traced
+from jaximp.numerics.cores import cores
 from jaximp.numerics.linear_algebra import root
 from jaximp.types import AnyArray
 
@@ -272,11 +272,6 @@ def _cut(pieces: list[Piece], start: int, stop: int | None) -> list[Piece]:
             parts.append(piece.part(max(start - first, 0), end))
         first += len(piece.y)
     return parts
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _solve_rows(task: Task, first: int, parts: list[Piece], skipped: int = 0) -> Any:

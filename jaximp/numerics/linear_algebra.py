@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.numerics.compilation import keep
-from jaximp.types import AnyArray
 
 SWEEPS = 10
 """Times that every pair of columns is turned against each other; the error falls with its square every time."""
@@ -28,7 +27,7 @@ def root(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), jnp.where(x == 0, 0, jnp.nan))
 
 
-def solve_pair(matrix: Num[AnyArray, "*#N 2 2"], right: Num[AnyArray, "*#N 2"]) -> Float[Array, "*N 2"]:
+def solve_pair(matrix: Num[Any, "*#N 2 2"], right: Num[Any, "*#N 2"]) -> Float[Array, "*N 2"]:
     """`x` with `matrix @ x = right`, by Cramer's rule."""
     (a, b), (c, d) = (matrix[..., 0, 0], matrix[..., 0, 1]), (matrix[..., 1, 0], matrix[..., 1, 1])
     first, second = right[..., 0], right[..., 1]
