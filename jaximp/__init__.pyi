@@ -14,8 +14,8 @@ from . import signals as signals
 from . import simulation as simulation
 from . import trust as trust
 from .design.excitation import Design as Design
-from .design.excitation import Limits as Limits
 from .design.excitation import design_excitation as design_excitation
+from .design.limits import Limits as Limits
 from .identification.estimates import Estimates as Estimates
 from .jobs.job import Job as Job
 from .jobs.job import parse_job as parse_job

@@ -1,9 +1,9 @@
 from .bounds import condition_bound as condition_bound
 from .excitation import Design as Design
-from .excitation import Encoder as Encoder
-from .excitation import Limits as Limits
 from .excitation import design_excitation as design_excitation
 from .files import read_trajectory as read_trajectory
 from .files import write_design as write_design
+from .limits import Limits as Limits
+from .motions import Encoder as Encoder
 from .perturbations import Perturbations as Perturbations
 from .perturbations import design_perturbations as design_perturbations

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, Shaped
 
-from jaximp.design.excitation import Limits, room
+from jaximp.design.limits import Limits, room
 from jaximp.design.objectives import log_condition
 from jaximp.models.arm import PlanarArm, rigid_body_torque
 from jaximp.models.inertia import BaseInertia

@@ -8,7 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from jaximp.design.excitation import OBJECTIVES, Design, Encoder, Limits, design_excitation
+from jaximp.design.excitation import OBJECTIVES, Design, design_excitation
+from jaximp.design.limits import Limits
+from jaximp.design.motions import Encoder
 from jaximp.jobs.job import ModelSettings, model_settings
 from jaximp.jobs.settings import check_keys, checked, read, settings
 from jaximp.models.base import Joints, Model, combine
@@ -52,7 +54,7 @@ class DesignSettings:
 
 @dataclass(frozen=True)
 class EncoderSettings:
-    """See `excitation.Encoder`."""
+    """See `motions.Encoder`."""
 
     step: float
     """Quantisation step [rad or m]."""

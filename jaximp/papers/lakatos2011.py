@@ -23,7 +23,7 @@ from jaxtyping import Array, PRNGKeyArray
 from numpy.typing import NDArray
 
 from jaximp import plots
-from jaximp.design.excitation import Limits
+from jaximp.design.limits import Limits
 from jaximp.design.perturbations import condition_of, design_perturbations
 from jaximp.identification.filter_settings import FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm, rigid_body_torque

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.design import excitation, objectives
+from jaximp.design import excitation, motions, objectives
 from jaximp.design.bounds import condition_bound
-from jaximp.design.excitation import Design, Encoder, Limits, design_excitation
+from jaximp.design.excitation import Design, design_excitation
+from jaximp.design.limits import Limits
+from jaximp.design.motions import Encoder
 from jaximp.models import HumanJoint, Joints, Model, RobotJoint
 from jaximp.motion.trajectories import FourierSeries, jerk
 from jaximp.numerics.optimise import METHODS, minimise, onto_polytope
@@ -157,13 +159,13 @@ def test_gradients_are_central_differences(objective: str, window: float | None)
         ROBOT, ROBOT, harmonics=4, period=10.0, limits=limits, objective=objective, parameter=parameter, window=window,
         parameters=PARAMETERS,
     )  # fmt: skip
-    x, t, random = excitation._random_starts(problem, 4, 0), problem.instants(), np.random.default_rng(1)
+    x, t, random = motions.random_starts(problem, 4, 0), problem.instants(), np.random.default_rng(1)
 
     @jax.jit
     @jax.value_and_grad
     def value(x: jax.Array) -> jax.Array:
-        series, _ = excitation._feasible(problem, x, t, jnp.asarray(0.1))
-        return excitation._worth(problem, series, t, jnp.asarray(0.1), jnp.asarray(20.0))
+        series, _ = motions.feasible_motion(problem, x, t, jnp.asarray(0.1))
+        return motions.worth_of(problem, series, t, jnp.asarray(0.1), jnp.asarray(20.0))
 
     for start in np.asarray(x):
         direction = random.normal(size=len(start))
@@ -293,7 +295,7 @@ def test_the_encoder_is_in_the_loop() -> None:
     t = np.arange(1000) / 100
     series = FourierSeries(*(np.atleast_2d(x) for x in (design.trajectory.sine, design.trajectory.cosine)),
                            np.atleast_1d(design.trajectory.offset), 10.0)  # fmt: skip
-    rows = excitation._rows(HUMAN, excitation._measured(encoder, series, jnp.asarray(t)), None, 10.0)[:, 0]
+    rows = motions.regressor_rows(HUMAN, motions.measured_motion(encoder, series, jnp.asarray(t)), None, 10.0)[:, 0]
     assert design.value == pytest.approx(float(np.linalg.svd(rows, compute_uv=False)[-1]), rel=1e-6)
 
 

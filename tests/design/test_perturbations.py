@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaximp.design.excitation import Limits
+from jaximp.design.limits import Limits
 from jaximp.design.perturbations import condition_of, design_perturbations
 from jaximp.models import BaseInertia, PlanarArm
 from jaximp.papers.lakatos2011 import noise_free_conditions

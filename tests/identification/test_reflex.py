@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from factories.joints import ankle_job
-from jaximp.design import excitation
+from jaximp.design import motions
 from jaximp.identification import FilterSettings
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import Filters
@@ -182,7 +182,7 @@ def test_of_a_periodic_motion_the_past_is_the_end_of_the_period() -> None:
     np.testing.assert_allclose(W[:, 3:], expected, atol=1e-12)
     long = ReflexPathway(1000.0, [1.0]).over_period(dq[:200], dq[:200], dq[:200], RATE)  # more than two periods
     np.testing.assert_allclose(long[:, 0], np.maximum(np.roll(dq[:200], 500), 0))
-    designed = excitation._rows(model, tuple(jax.numpy.asarray(x)[:, None] for x in (q, dq, ddq)), None, PERIOD)
+    designed = motions.regressor_rows(model, tuple(jax.numpy.asarray(x)[:, None] for x in (q, dq, ddq)), None, PERIOD)
     np.testing.assert_allclose(designed[:, 0], W, atol=1e-12)
 
 
