@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from factories.studies import content, run
-from jaximp.batch import run as batch
+from jaximp.batch import workers as batch_workers
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypa
     with pytest.raises(ValueError, match="one of the two"):
         run(study, tmp_path / "a", workers=2, scheduler="tcp://127.0.0.1:1")
     pytest.importorskip("distributed")
-    monkeypatch.setattr(batch, "PATIENCE", 1.0)
+    monkeypatch.setattr(batch_workers, "PATIENCE", 1.0)
     with pytest.raises(ValueError, match="no Dask scheduler answers at tcp://127"):
         run(study, tmp_path / "b", scheduler="tcp://127.0.0.1:1")
     monkeypatch.setitem(sys.modules, "distributed", None)
