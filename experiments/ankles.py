@@ -186,7 +186,7 @@ class Wrong:
     torque: Callable[[Motion], Numbers]
     """Without noise and offset."""
     culprits: tuple[str, ...]
-    """Groups of `jaximp.identification.misfit.SUSPECTS`, any of which names it rightly."""
+    """Groups of `jaximp.identification.suspects.SUSPECTS`, any of which names it rightly."""
 
 
 def reflex(gain: float, delay: float = 0.05, muscle: float = 0.02) -> Wrong:

@@ -23,7 +23,8 @@ import numpy as np
 
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
-from jaximp.identification.misfit import SUSPECTS, culprits
+from jaximp.identification.misfit import culprits
+from jaximp.identification.suspects import SUSPECTS
 from jaximp.trust.score_tests import FAMILYWISE, SHARE, significant
 from jaximp.trust.verdicts import NO_DATA
 from jaximp.trust.window_rules import NOTHING_MISSING

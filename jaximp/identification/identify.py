@@ -225,16 +225,15 @@ def in_windows(
 
 
 def _misfits(prepared: Prepared, fit: SlidingFit) -> tuple[Misfit, ...]:
-    """What the model of one joint lacks; nothing is known of others, or without white rows."""
-    if not prepared.white or prepared.recording.n_joints != 1:
+    """What the model of one joint or of an arm lacks; nothing is known without white rows."""
+    if not prepared.white:
         return ()
-    (white,), rows = prepared.white, prepared.rows
     theta = np.asarray(fit.theta)
     known = theta[np.isfinite(theta).all(axis=1)]
     if not len(known):
         return ()
     usual = np.median(known, axis=0)
-    return find_misfits(prepared.pipeline, prepared.recording, white.W, white.torque, white, rows.valid, usual)
+    return find_misfits(prepared.pipeline, prepared.recording, prepared.rows, prepared.white[0], usual)
 
 
 def _room(place: Placement) -> int | None:

@@ -1,139 +1,66 @@
-"""What a model of one joint may lack: further columns of its motion, tested in white rows over the whole record."""
+"""What a model lacks: further columns, tested in white rows over the whole record, and what is said of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp import signals
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import measured_motion
+from jaximp.identification.regression import Rows
+from jaximp.identification.suspects import of_arm, of_one_joint, remedy, tag, untagged, what
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
-REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
-"""How long the rectified velocity takes to the muscle, and time constants of its torque, which builds up as behind a
-critically damped low-pass of second order [s]; in both directions."""
-SLOW = 0.3
-"""Velocity below which dry friction builds up, as a share of its root mean square."""
-YIELDING = (0.01, 0.04)
-"""Time constants of what yields between the position and the torque [s]."""
-
-
-@dataclass(frozen=True)
-class Suspect:
-    """A group of columns, and what it stands for."""
-
-    what: str
-    remedy: str
-    columns: Callable[[_Motion], list[Numbers]]
-
-
-@dataclass(frozen=True)
-class _Motion:
-    """Of one joint, behind the position's filter, at every sample."""
-
-    t: Numbers
-    q: Numbers
-    dq: Numbers
-    ddq: Numbers
-    jerk: Numbers
-    snap: Numbers
-    rate: float
-
-    def later(self, x: Numbers, seconds: float) -> Numbers:
-        """What x was so long ago."""
-        lag = round(seconds * self.rate)
-        return np.concatenate([np.zeros(lag), x[: len(x) - lag]])
-
-    def yielding(self, x: Numbers, seconds: float) -> Numbers:
-        """x behind a first-order lag; of no seconds, x itself."""
-        from scipy.signal import lfilter
-
-        a = np.exp(-1 / (seconds * self.rate)) if seconds else 0.0
-        return np.asarray(lfilter([1 - a], [1, -a], x))
-
-    def twitch(self, x: Numbers, seconds: float) -> Numbers:
-        """The torque of a muscle that is told x."""
-        return self.yielding(self.yielding(x, seconds), seconds)
-
-
-SUSPECTS: Mapping[str, Suspect] = {
-    "reflex": Suspect(
-        "a stretch reflex",
-        "try model.human.reflex = true",
-        lambda m: [
-            m.twitch(m.later(np.maximum(sign * m.dq, 0), REFLEX_DELAY), seconds)
-            for sign in (1, -1)
-            for seconds in MUSCLE
-        ],
-    ),
-    "stiffness": Suspect(
-        "a stiffness that depends on the angle",
-        "move less far, or around one angle at a time",
-        lambda m: [(m.q - m.q.mean()) ** 2, (m.q - m.q.mean()) ** 3],
-    ),
-    "friction": Suspect(
-        "dry friction",
-        "model it (coulomb), or leave out slow samples (window.min_velocity)",
-        lambda m: [np.sign(m.dq), np.tanh(m.dq / (SLOW * np.sqrt(np.mean(m.dq**2)) + 1e-300))],
-    ),
-    "delay": Suspect(
-        "a delay between torque and position",
-        "check the clocks and filters of both channels",
-        lambda m: [m.jerk],
-    ),
-    "lag": Suspect(
-        "something that yields or filters between position and torque (a cuff, an amplifier)",
-        "measure the position where the torque acts, and use one filter for both channels",
-        lambda m: [m.snap, *(m.yielding(m.ddq, seconds) for seconds in YIELDING)],
-    ),
-    "drift": Suspect(
-        "a steady change inside the windows",
-        "shorten window.length",
-        lambda m: [(m.t - m.t.mean()) * m.q, (m.t - m.t.mean()) * m.dq],
-    ),
-}
-"""Who is asked, by name."""
 HIDES = {"lag": "stiffness"}
 """Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
 
 
 def find_misfits(
-    pipeline: Pipeline,
-    recording: Recording,
-    W: AnyArray,
-    torque: AnyArray,
-    white: White,
-    valid: AnyArray,
-    theta: Numbers,
+    pipeline: Pipeline, recording: Recording, rows: Rows, white: White, theta: Numbers
 ) -> tuple[Misfit, ...]:
-    """Test all `SUSPECTS` in the white rows W (N, p) and torque (N,) of one joint, whose parameters are some theta."""
-    filters, motion = pipeline.filters, _motion_of(pipeline, recording)
-    groups = {}
-    for name, suspect in SUSPECTS.items():
-        columns = np.stack(suspect.columns(motion), axis=1)
-        if filters.parallel is not None:
-            from scipy.signal import sosfiltfilt
+    """Test all suspects of one joint, or of an arm, whose parameters are some theta (p,).
 
-            columns = sosfiltfilt(np.array(filters.parallel), columns, axis=0)
-        groups[name] = white.apply(columns[:: filters.decimate][: len(W)], valid)
-    counts = np.asarray(valid, bool)
-    found = score_groups(np.asarray(W), np.asarray(torque), groups, counts, pipeline.window_rows, white.every)
-    delay = next((_undelayed(one, pipeline.model.roles, theta) for one in found if one.group == "delay"), None)
-    if delay is None:
-        return tuple(found)
-    # To slow motion whatever yields is a delay: that tells what it does to the parameters, its own weights do not.
-    late = {"delay": delay, "lag": delay}
-    return tuple(
+    **Arguments:** `rows` as they were filtered, and `white`.
+    """
+    if recording.n_joints > 1:
+        groups = of_arm(pipeline, recording, rows.W, theta)
+        found = _tested(pipeline, white, rows.valid, groups)
+        return tuple(_as_delayed(found, [tag("delay", j) for j in range(recording.n_joints)]))
+    one_joint = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, len(rows.W)))
+    found = _tested(pipeline, white, rows.valid, one_joint)
+    late = [_undelayed(one, pipeline.model.roles, theta) if one.group == "delay" else one for one in found]
+    return tuple(_as_delayed(late, ["delay"]))
+
+
+def _tested(
+    pipeline: Pipeline, white: White, valid: AnyArray, groups: Iterable[tuple[str, Mapping[int, Numbers]]]
+) -> list[Misfit]:
+    """Tests of groups whose columns (N, g) act on the torque of some outputs, with those of all outputs in a row."""
+    W, torque, counts = (np.asarray(x) for x in (white.W, white.torque, valid))
+    outputs = 1 if torque.ndim == 1 else torque.shape[1]
+    counts = counts.astype(bool).reshape(-1, outputs)
+    whole = {}
+    for name, by_output in groups:
+        columns = np.zeros((*counts.shape, next(iter(by_output.values())).shape[1]))
+        for j, acting in by_output.items():
+            columns[:, j] = white.apply(acting, counts[:, j], j)
+        whole[name] = columns.reshape(-1, columns.shape[-1])
+    W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
+    return score_groups(W, torque.ravel(), whole, counts.ravel(), window, white.every)
+
+
+def _as_delayed(misfits: Sequence[Misfit], delays: Sequence[str]) -> list[Misfit]:
+    """To slow motion whatever yields is a delay: that tells what it does to the parameters, its own weights do not."""
+    late = {one.group.replace("delay", "lag"): one for one in misfits if one.group in delays}
+    return [
         replace(one, move=late[one.group].move, stderr=late[one.group].stderr) if one.group in late else one
-        for one in found
-    )
+        for one in misfits
+    ]
 
 
 def _undelayed(misfit: Misfit, roles: Sequence[Role], theta: Numbers) -> Misfit:
@@ -155,18 +82,6 @@ def _undelayed(misfit: Misfit, roles: Sequence[Role], theta: Numbers) -> Misfit:
     return replace(misfit, move=move, stderr=relative * np.abs(move))
 
 
-def _motion_of(pipeline: Pipeline, recording: Recording) -> _Motion:
-    from scipy.signal import sosfiltfilt
-
-    filters, rate = pipeline.filters, recording.sample_rate
-    q = measured_motion(pipeline.filter, recording).position[:, 0]
-    if filters.position is not None:
-        q = sosfiltfilt(np.array(filters.position), q)
-    dq, ddq = signals.differentiate(q, rate, filters.differentiator)
-    jerk, snap = signals.differentiate(ddq, rate, filters.differentiator)
-    return _Motion(recording.time, q, dq, ddq, jerk, snap, rate)
-
-
 def off_by(
     misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()
 ) -> dict[str, float]:
@@ -183,7 +98,7 @@ def off_by(
                 found.setdefault(name, float(share))
             elif error > SHARE:
                 found.setdefault(name, np.nan)
-    hidden = HIDES.get(_suspected(misfits)[0].group) if found else None
+    hidden = HIDES.get(untagged(_suspected(misfits)[0].group)[0]) if found else None
     for name, kind in zip(names, kinds, strict=False):
         if kind == hidden:
             found.setdefault(name, np.nan)
@@ -198,7 +113,7 @@ def _suspected(misfits: Sequence[Misfit]) -> list[Misfit]:
 
 def culprits(misfits: Sequence[Misfit]) -> str:
     """What is missing, in words."""
-    return " or ".join(SUSPECTS[one.group].what for one in _suspected(misfits))
+    return " or ".join(dict.fromkeys(what(one.group) for one in _suspected(misfits)))
 
 
 def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
@@ -223,7 +138,7 @@ def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) ->
 
 def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, str]:
     """Why these parameters cannot be trusted, and what to do; empty where none is off."""
-    return (in_words(misfits, off), SUSPECTS[significant(misfits)[0].group].remedy) if off else ("", "")
+    return (in_words(misfits, off), remedy(significant(misfits)[0].group)) if off else ("", "")
 
 
 def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
@@ -243,4 +158,4 @@ def unnoticed(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, ki
     blinded = ", ".join(f"{name} by {part:.0%}" for name, part in zip(names, share, strict=True) if part > SHARE)
     if not blinded:
         return ""
-    return f"this motion cannot show everything: {SUSPECTS[worst.group].what}, say, could move {blinded} unnoticed"
+    return f"this motion cannot show everything: {what(worst.group)}, say, could move {blinded} unnoticed"

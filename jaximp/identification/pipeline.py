@@ -10,7 +10,7 @@ import numpy as np
 from jaximp import signals
 from jaximp.identification.filter_settings import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
-from jaximp.models.base import Joints, Model
+from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
 from jaximp.trust.limits import TrustLimits
@@ -75,13 +75,8 @@ class Pipeline:
 
     @property
     def whitens(self) -> bool:
-        """Whether the noise is estimated, and windows are solved in rows where it is white.
-
-        Not for joints that share parameters: nothing tests yet what their model lacks, and white rows lean on the
-        frequencies where models are wrong first.
-        """
-        alone = self.model.n_joints == 1 or isinstance(self.model, Joints)
-        return self.once and alone and self.window.noise == "estimated"
+        """Whether the noise is estimated, and windows are solved in rows where it is white."""
+        return self.once and self.window.noise == "estimated"
 
     @property
     def window_samples(self) -> int:

@@ -72,10 +72,10 @@ class White:
             found.append(shape * size / (shape.sum() * frequency[1]))
         return np.stack(found)
 
-    def apply(self, columns: AnyArray, valid: AnyArray) -> NDArray[np.float64]:
-        """Further columns (N, *k) through the same filter, of the last output."""
+    def apply(self, columns: AnyArray, valid: AnyArray, output: int = -1) -> NDArray[np.float64]:
+        """Further columns (N, *k) through the same filter, of one output."""
         before = whiten_rows(columns, valid, self.filtered)
-        return np.asarray(whiten_rows(before, valid, self.noise[-1])) / self.size[-1]
+        return np.asarray(whiten_rows(before, valid, self.noise[output])) / self.size[output]
 
 
 def rows_apart(pipeline: Pipeline) -> int:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filter_settings import design_filters
-from jaximp.identification.misfit import SUSPECTS
 from jaximp.identification.separation import METHODS
+from jaximp.identification.suspects import what
 from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
@@ -326,10 +326,8 @@ def _tests(content: dict[str, Any]) -> list[Section]:
     columns = [Column("Is this missing?", "text"), Column("p"), *(Column(f"moves {words(name)} by") for name in names)]
     rows = []
     for one in content["tests"]:
-        joint, _, group = one["group"].rpartition(": ")
-        what = SUSPECTS[group].what
         moves = [f"{number(one['move'][name], 2)} ± {number(one['move_stderr'][name], 1)}" for name in names]
-        rows.append([f"{joint}: {what}" if joint else what, number(one["p"], 2), *moves])
+        rows.append([what(one["group"]), number(one["p"], 2), *moves])
     said = "; ".join(content["lacking"].values()) or "Nothing that moves a parameter beyond error and 5 % was found."
     told = (
         "Each row adds columns to the model, over all windows at once, in rows whose noise is white. p is the "

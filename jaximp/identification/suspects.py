@@ -1,0 +1,247 @@
+"""What a model may lack, as further columns of the torque of one joint: who is asked, and in which columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximp import signals
+from jaximp.identification.filter_settings import Filters
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.regression import measured_motion
+from jaximp.types import AnyArray, Numbers, Recording
+
+REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
+"""How long the rectified velocity takes to the muscle, and time constants of its torque, which builds up as behind a
+critically damped low-pass of second order [s]; in both directions."""
+SLOW = 0.3
+"""Velocity below which dry friction builds up, as a share of its root mean square."""
+YIELDING = (0.01, 0.04)
+"""Time constants of what yields between the position and the torque [s]."""
+WIDEST_BAND = 0.9
+"""Of derivatives of rows, as a share of half their rate."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Of one joint, behind the position's filter, at every sample."""
+
+    t: Numbers
+    q: Numbers
+    dq: Numbers
+    ddq: Numbers
+    jerk: Numbers
+    snap: Numbers
+    rate: float
+
+    def later(self, x: Numbers, seconds: float) -> Numbers:
+        """What x was so long ago."""
+        lag = round(seconds * self.rate)
+        return np.concatenate([np.zeros(lag), x[: len(x) - lag]])
+
+    def twitch(self, x: Numbers, seconds: float) -> Numbers:
+        """The torque of a muscle that is told x."""
+        return yielding(yielding(x, seconds, self.rate), seconds, self.rate)
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A group of columns, and what it stands for."""
+
+    what: str
+    remedy: str
+    columns: Callable[[Motion], list[Numbers]]
+
+
+def yielding(x: Numbers, seconds: float, rate: float) -> Numbers:
+    """x behind a first-order lag; of no seconds, x itself."""
+    from scipy.signal import lfilter
+
+    a = np.exp(-1 / (seconds * rate)) if seconds else 0.0
+    return np.asarray(lfilter([1 - a], [1, -a], x))
+
+
+SUSPECTS: Mapping[str, Suspect] = {
+    "reflex": Suspect(
+        "a stretch reflex",
+        "try model.human.reflex = true",
+        lambda m: [
+            m.twitch(m.later(np.maximum(sign * m.dq, 0), REFLEX_DELAY), seconds)
+            for sign in (1, -1)
+            for seconds in MUSCLE
+        ],
+    ),
+    "stiffness": Suspect(
+        "a stiffness that depends on the angle",
+        "move less far, or around one angle at a time",
+        lambda m: [(m.q - m.q.mean()) ** 2, (m.q - m.q.mean()) ** 3],
+    ),
+    "friction": Suspect(
+        "dry friction",
+        "model it (coulomb), or leave out slow samples (window.min_velocity)",
+        lambda m: [np.sign(m.dq), np.tanh(m.dq / (SLOW * np.sqrt(np.mean(m.dq**2)) + 1e-300))],
+    ),
+    "delay": Suspect(
+        "a delay between torque and position",
+        "check the clocks and filters of both channels",
+        lambda m: [m.jerk],
+    ),
+    "lag": Suspect(
+        "something that yields or filters between position and torque (a cuff, an amplifier)",
+        "measure the position where the torque acts, and use one filter for both channels",
+        lambda m: [m.snap, *(yielding(m.ddq, seconds, m.rate) for seconds in YIELDING)],
+    ),
+    "drift": Suspect(
+        "a steady change inside the windows",
+        "shorten window.length",
+        lambda m: [(m.t - m.t.mean()) * m.q, (m.t - m.t.mean()) * m.dq],
+    ),
+}
+"""Who is asked of one joint, by name."""
+
+
+# --- arms: every joint by itself, and what moves both --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Explained:
+    """The torque of one joint by the model, with its derivatives, at every row."""
+
+    torque: Numbers
+    slope: Numbers
+    curvature: Numbers
+    rate: float
+    """Of the rows [Hz]."""
+
+
+@dataclass(frozen=True)
+class OfTorque:
+    """A group of columns that are made of the torque itself, as whatever stands between torque and motion makes them
+    of many columns at once."""
+
+    what: str
+    remedy: str
+    columns: Callable[[Explained], list[Numbers]]
+
+
+def _reworded(name: str, remedy: str) -> Suspect:
+    return Suspect(SUSPECTS[name].what, remedy, SUSPECTS[name].columns)
+
+
+OF_JOINTS: Mapping[str, Suspect] = {
+    "reflex": _reworded("reflex", "perturb less, or more briefly than a reflex takes"),
+    "stiffness": SUSPECTS["stiffness"],
+    "friction": _reworded("friction", "model it (coulomb = true), or leave out slow samples (window.min_velocity)"),
+    "viscous": Suspect("viscous friction", "model it (viscous = true)", lambda m: [m.dq]),
+    "rotor": Suspect("a motor's inertia", "model it (rotor = true), and leave out lengths", lambda m: [m.ddq]),
+    "offset": Suspect("a constant torque", "model it (offset = true)", lambda m: [np.ones_like(m.t)]),
+    "drift": SUSPECTS["drift"],
+}
+"""Who is asked of each joint of an arm; its column acts on the torque of this joint alone."""
+OF_MUSCLES = ("reflex", "stiffness")
+"""Who is asked where joints have muscles, as a model with stiffness says."""
+OF_TORQUES: Mapping[str, OfTorque] = {
+    name: OfTorque(SUSPECTS[name].what, SUSPECTS[name].remedy, columns)
+    for name, columns in {
+        "delay": lambda e: [e.slope],
+        "lag": lambda e: [e.curvature, *(yielding(e.torque, seconds, e.rate) for seconds in YIELDING)],
+    }.items()
+}
+"""Who is asked of each joint of an arm, by the torque that the model gives it."""
+GRAVITY = Suspect("gravity of another kind", "look at gravity, zero and lengths in model.arm", lambda m: [])
+"""Who is asked of both joints together."""
+WORDS: Mapping[str, Suspect | OfTorque] = {**OF_JOINTS, **SUSPECTS, "gravity": GRAVITY}
+
+
+def tag(name: str, joint: int) -> str:
+    """The name of a group of one joint of several, counted from zero."""
+    return f"joint {joint + 1}: {name}"
+
+
+def untagged(group: str) -> tuple[str, int | None]:
+    """Name, and joint counted from zero, of a group of one joint of several."""
+    joint, _, name = group.rpartition(": ")
+    return name, int(joint.split()[-1]) - 1 if joint else None
+
+
+def what(group: str) -> str:
+    """What a group stands for, in words: `dry friction of joint 2`."""
+    name, joint = untagged(group)
+    return WORDS[name].what if joint is None else f"{WORDS[name].what} of joint {joint + 1}"
+
+
+def remedy(group: str) -> str:
+    """Against what a group stands for."""
+    name, joint = untagged(group)
+    return (WORDS if joint is None else {**WORDS, **OF_JOINTS})[name].remedy
+
+
+# --- columns -------------------------------------------------------------------------------------------------------
+
+
+def of_one_joint(pipeline: Pipeline, recording: Recording, rows: int) -> Iterator[tuple[str, Numbers]]:
+    """Columns (N, g) of all `SUSPECTS`, behind the filters."""
+    (motion,) = motions(pipeline, recording)
+    for name, suspect in SUSPECTS.items():
+        yield name, behind_filters(pipeline.filters, suspect.columns(motion), rows)
+
+
+def of_arm(
+    pipeline: Pipeline, recording: Recording, W: AnyArray, theta: Numbers
+) -> Iterator[tuple[str, dict[int, Numbers]]]:
+    """Of all suspects of an arm the columns (N, g) of each joint whose torque they act on, behind the filters.
+
+    **Arguments:** `W` (N, n, p) rows as they were filtered, and the parameters `theta` (p,), near which it lies.
+    """
+    filters, each = pipeline.filters, motions(pipeline, recording)
+    muscles = any(role.kind == "stiffness" for role in pipeline.model.roles)
+    explained = _explained(pipeline, np.asarray(W) @ theta)
+    for j, motion in enumerate(each):
+        for name, suspect in OF_JOINTS.items():
+            if muscles or name not in OF_MUSCLES:
+                yield tag(name, j), {j: behind_filters(filters, suspect.columns(motion), len(W))}
+        for name, by_torque in OF_TORQUES.items():
+            yield tag(name, j), {j: np.stack(by_torque.columns(explained[j]), axis=1)}
+    if pipeline.model.label == "arm":
+        first, both = (each[0].q, each[0].q + each[1].q)
+        angles = {0: [np.sin(first), np.cos(first)], 1: [np.zeros_like(first)] * 2}
+        columns = {j: [*angles[j], np.sin(both), np.cos(both)] for j in angles}
+        yield "gravity", {j: behind_filters(filters, columns[j], len(W)) for j in columns}
+
+
+def behind_filters(filters: Filters, columns: list[Numbers], rows: int) -> Numbers:
+    """(rows, g) of columns of every sample."""
+    together = np.stack(columns, axis=1)
+    if filters.parallel is not None:
+        from scipy.signal import sosfiltfilt
+
+        together = sosfiltfilt(np.array(filters.parallel), together, axis=0)
+    return np.asarray(together[:: filters.decimate][:rows])
+
+
+def motions(pipeline: Pipeline, recording: Recording) -> list[Motion]:
+    """Of every joint."""
+    from scipy.signal import sosfiltfilt
+
+    filters, rate = pipeline.filters, recording.sample_rate
+    position = measured_motion(pipeline.filter, recording).position
+    found = []
+    for q in position.T:
+        if filters.position is not None:
+            q = sosfiltfilt(np.array(filters.position), q)
+        dq, ddq = signals.differentiate(q, rate, filters.differentiator)
+        jerk, snap = signals.differentiate(ddq, rate, filters.differentiator)
+        found.append(Motion(recording.time, q, dq, ddq, jerk, snap, rate))
+    return found
+
+
+def _explained(pipeline: Pipeline, torque: Numbers) -> list[Explained]:
+    """Of rows (N, n) of the torque by the model."""
+    filters = pipeline.filters
+    rate = pipeline.sample_rate / filters.decimate
+    band = min(WIDEST_BAND, (WIDEST_BAND if filters.band is None else filters.band) * filters.decimate)
+    by = signals.design_differentiator(band)
+    slope, curvature = signals.differentiate(torque, rate, by if len(torque) > 2 * by.half else signals.CENTRAL)
+    return [Explained(torque[:, j], slope[:, j], curvature[:, j], rate) for j in range(torque.shape[1])]
