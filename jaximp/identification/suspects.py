@@ -151,8 +151,13 @@ OF_TORQUES: Mapping[str, OfTorque] = {
 }
 """Who is asked of each joint of an arm, by the torque that the model gives it."""
 GRAVITY = Suspect("gravity of another kind", "look at gravity, zero and lengths in model.arm", lambda m: [])
+SCALE = Suspect(
+    "one scale of both joints' torques",
+    "check units, gear ratios and torque constants of both joints",
+    lambda m: [],
+)
 """Who is asked of both joints together."""
-WORDS: Mapping[str, Suspect | OfTorque] = {**OF_JOINTS, **SUSPECTS, "gravity": GRAVITY}
+WORDS: Mapping[str, Suspect | OfTorque] = {**OF_JOINTS, **SUSPECTS, "gravity": GRAVITY, "scale": SCALE}
 
 
 def tag(name: str, joint: int) -> str:
@@ -208,6 +213,9 @@ def of_arm(
         first, both = (each[0].q, each[0].q + each[1].q)
         angles = {0: [np.sin(first), np.cos(first)], 1: [np.zeros_like(first)] * 2}
         columns = {j: [*angles[j], np.sin(both), np.cos(both)] for j in angles}
+        shared = (np.abs(W) > 0).any(axis=0).all(axis=0)
+        if shared.any():
+            yield "scale", {1: np.asarray(W)[:, 1, shared]}
         yield "gravity", {j: behind_filters(filters, columns[j], len(W)) for j in columns}
 
 
