@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
-from jaximp.identification.suspects import of_arm, of_one_joint, remedy, tag, untagged, what
+from jaximp.identification.suspects import of_arm, of_one_joint, remedy, untagged, what
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
@@ -28,35 +28,79 @@ def find_misfits(
     **Arguments:** `rows` as they were filtered, and `white`.
     """
     if recording.n_joints > 1:
-        groups = of_arm(pipeline, recording, rows.W, theta)
-        found = _tested(pipeline, white, rows.valid, groups)
-        return tuple(_as_delayed(found, [tag("delay", j) for j in range(recording.n_joints)]))
+        tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
+        return tuple(_as_delayed(_one_after_another(tests)))
     one_joint = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, len(rows.W)))
-    found = _tested(pipeline, white, rows.valid, one_joint)
+    found = Tests.of(pipeline, white, rows.valid, one_joint)()
     late = [_undelayed(one, pipeline.model.roles, theta) if one.group == "delay" else one for one in found]
-    return tuple(_as_delayed(late, ["delay"]))
+    return tuple(_as_delayed(late))
 
 
-def _tested(
-    pipeline: Pipeline, white: White, valid: AnyArray, groups: Iterable[tuple[str, Mapping[int, Numbers]]]
-) -> list[Misfit]:
-    """Tests of groups whose columns (N, g) act on the torque of some outputs, with those of all outputs in a row."""
-    W, torque, counts = (np.asarray(x) for x in (white.W, white.torque, valid))
-    outputs = 1 if torque.ndim == 1 else torque.shape[1]
-    counts = counts.astype(bool).reshape(-1, outputs)
-    whole = {}
-    for name, by_output in groups:
-        columns = np.zeros((*counts.shape, next(iter(by_output.values())).shape[1]))
-        for j, acting in by_output.items():
-            columns[:, j] = white.apply(acting, counts[:, j], j)
-        whole[name] = columns.reshape(-1, columns.shape[-1])
-    W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
-    return score_groups(W, torque.ravel(), whole, counts.ravel(), window, white.every)
+@dataclass(frozen=True)
+class Tests:
+    """White rows, those of all outputs in a row, and further columns through the same filters."""
+
+    W: Numbers
+    torque: Numbers
+    valid: NDArray[np.bool_]
+    groups: Mapping[str, Numbers]
+    window: int
+    every: int
+
+    @classmethod
+    def of(
+        cls, pipeline: Pipeline, white: White, valid: AnyArray, groups: Iterable[tuple[str, Mapping[int, Numbers]]]
+    ) -> Tests:
+        """**Arguments:** `valid` (N, *n); `groups` of columns (N, g), by the output on whose torque they act."""
+        W, torque = np.asarray(white.W), np.asarray(white.torque)
+        outputs = 1 if torque.ndim == 1 else torque.shape[1]
+        counts = np.asarray(valid, bool).reshape(-1, outputs)
+        whole = {}
+        for name, by_output in groups:
+            columns = np.zeros((*counts.shape, next(iter(by_output.values())).shape[1]))
+            for j, acting in by_output.items():
+                columns[:, j] = white.apply(acting, counts[:, j], j)
+            whole[name] = columns.reshape(-1, columns.shape[-1])
+        W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
+        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every)
+
+    def __call__(self) -> list[Misfit]:
+        """Test every group."""
+        return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every)
+
+    def without(self, found: Sequence[Misfit]) -> Tests:
+        """Of the groups of other joints, with all that these groups of one joint explain taken off the torque."""
+        joint = untagged(found[0].group)[1]
+        gone = {one.group for one in found}
+        others = {
+            name: columns
+            for name, columns in self.groups.items()
+            if name not in gone and (joint is None or untagged(name)[1] != joint)
+        }
+        columns = np.concatenate([self.groups[name] for name in sorted(gone)], axis=1)
+        (together,) = replace(self, groups={"together": columns})()
+        return replace(self, torque=self.torque - columns @ together.weights, groups=others)
 
 
-def _as_delayed(misfits: Sequence[Misfit], delays: Sequence[str]) -> list[Misfit]:
+def _one_after_another(tests: Tests) -> list[Misfit]:
+    """Every joint may lack something of its own: groups of other joints are tested beside those that explain most,
+    which their columns may only imitate."""
+    found = {}
+    names = list(tests.groups)
+    while tests.groups:
+        these = tests()
+        found |= {one.group: one for one in these}
+        best = _suspected(these)
+        if not best:
+            break
+        joint = untagged(best[0].group)[1]
+        tests = tests.without([one for one in best if untagged(one.group)[1] == joint])
+    return [found[name] for name in names if name in found]
+
+
+def _as_delayed(misfits: Sequence[Misfit]) -> list[Misfit]:
     """To slow motion whatever yields is a delay: that tells what it does to the parameters, its own weights do not."""
-    late = {one.group.replace("delay", "lag"): one for one in misfits if one.group in delays}
+    late = {one.group.replace("delay", "lag"): one for one in misfits if untagged(one.group)[0] == "delay"}
     return [
         replace(one, move=late[one.group].move, stderr=late[one.group].stderr) if one.group in late else one
         for one in misfits
@@ -106,14 +150,19 @@ def off_by(
 
 
 def _suspected(misfits: Sequence[Misfit]) -> list[Misfit]:
-    """The group that explains most, and those that explain nearly as much; what explains less is not needed."""
+    """Of every joint the group that explains most, and those that explain nearly as much; what explains less is not
+    needed."""
     found = significant(misfits)
-    return [one for one in found if one.evidence >= ALIKE * found[0].evidence]
+    most = {untagged(one.group)[1]: one.evidence for one in reversed(found)}
+    return [one for one in found if one.evidence >= ALIKE * most[untagged(one.group)[1]]]
 
 
 def culprits(misfits: Sequence[Misfit]) -> str:
     """What is missing, in words."""
-    return " or ".join(dict.fromkeys(what(one.group) for one in _suspected(misfits)))
+    by_joint: dict[int | None, list[str]] = {}
+    for one in _suspected(misfits):
+        by_joint.setdefault(untagged(one.group)[1], []).append(what(one.group))
+    return " and ".join(" or ".join(names) for names in by_joint.values())
 
 
 def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:

@@ -146,7 +146,7 @@ OF_TORQUES: Mapping[str, OfTorque] = {
     name: OfTorque(SUSPECTS[name].what, SUSPECTS[name].remedy, columns)
     for name, columns in {
         "delay": lambda e: [e.slope],
-        "lag": lambda e: [e.curvature, *(yielding(e.torque, seconds, e.rate) for seconds in YIELDING)],
+        "lag": lambda e: [e.curvature, *(yielding(e.torque, seconds, e.rate) - e.torque for seconds in YIELDING)],
     }.items()
 }
 """Who is asked of each joint of an arm, by the torque that the model gives it."""
