@@ -1,5 +1,5 @@
-"""Simulated recordings of planar arms: a human's that a robot moves, and a robot's in the vertical plane. Each joint has
-torque noise of its own, and some arms do what the model does not know.
+"""Simulated recordings of planar arms: a human's that a robot moves, and a robot's in the vertical plane. Each joint
+has torque noise of its own, and some arms do what the model does not know.
 
 Each joint moves as the ankle of `ankles` does, by a motion of its own that is known exactly.
 """

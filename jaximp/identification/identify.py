@@ -18,10 +18,20 @@ from numpy.typing import NDArray
 
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
-from jaximp.identification.misfit import by_bands, find_misfits, harmless, in_words, missing, off_by, unnoticed
+from jaximp.identification.misfit import (
+    RobotTests,
+    by_bands,
+    find_human_misfits,
+    find_misfits,
+    harmless,
+    in_words,
+    missing,
+    off_by,
+    unnoticed,
+)
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
-from jaximp.identification.separation import METHODS, Regression, Separation, Whiten, fit_robot, separate
+from jaximp.identification.separation import METHODS, Regression, Separation, Whiten, fit_robot, robot_columns, separate
 from jaximp.identification.solving import (
     MOST_ROWS,
     Placement,
@@ -72,6 +82,8 @@ class _Pair:
     robot_fit: WindowFit
     alone: Regression
     loaded: Regression
+    tests: RobotTests | None
+    """Of the robot's model, where the pipeline whitens."""
 
 
 @dataclass(frozen=True)
@@ -228,12 +240,26 @@ def _misfits(prepared: Prepared, fit: SlidingFit) -> tuple[Misfit, ...]:
     """What the model of one joint or of an arm lacks; nothing is known without white rows."""
     if not prepared.white:
         return ()
+    usual = _usual(fit)
+    if usual is None:
+        return ()
+    return find_misfits(prepared.pipeline, prepared.recording, prepared.rows, prepared.white[0], usual)
+
+
+def _human_misfits(prepared: Prepared, pair: _Pair, found: Separation, method: int) -> tuple[Misfit, ...]:
+    """What the model of a human in a robot lacks by one of the methods, or the robot's, if that moves the human's."""
+    usual = _usual(found.fit)
+    if pair.tests is None or usual is None:
+        return ()
+    left = partial(robot_columns, method, loaded=pair.loaded)
+    return find_human_misfits(prepared.pipeline, prepared.recording, found, usual, left, pair.tests)
+
+
+def _usual(fit: SlidingFit) -> NDArray[np.float64] | None:
+    """(p,) median over the windows that are solved, if there are any."""
     theta = np.asarray(fit.theta)
     known = theta[np.isfinite(theta).all(axis=1)]
-    if not len(known):
-        return ()
-    usual = np.median(known, axis=0)
-    return find_misfits(prepared.pipeline, prepared.recording, prepared.rows, prepared.white[0], usual)
+    return np.median(known, axis=0) if len(known) else None
 
 
 def _room(place: Placement) -> int | None:
@@ -259,11 +285,12 @@ def _by_methods(prepared: Prepared, pair: _Pair, place: Placement, progress: Pro
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
         solved = _predict(human, found.fit, place)
-        notes, own = (METHODS[method], found.warning), prepared
+        notes, own = (METHODS[method], found.warning, pair.tests.note if pair.tests else ""), prepared
         if found.white is not None and rows.noisy is not None:
             noisy = found.white.apply(rows.noisy[:n, len(pair.robot.names) :], rows.valid[:n])
             own = replace(prepared, column_noise=np.sqrt((noisy**2).mean(axis=0)))
-        estimates = _estimates(own, human, solved, place, method, *notes, gain=gain, curves=curves)
+        misfits = _human_misfits(prepared, pair, found, method)
+        estimates = _estimates(own, human, solved, place, method, *notes, gain=gain, curves=curves, misfits=misfits)
         results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
         progress((count + 1) / len(methods))
     return results
@@ -426,13 +453,16 @@ def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone:
     whole_record = once(pipeline)
     whole = regress_pair(whole_record, robot, alone)[0]
     known = None if pipeline.whitens else noise_of(whole_record)
-    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), _whitener(pipeline))
+    whitener = _whitener(pipeline)
+    white = None if whitener is None else whitener(whole.robot, whole.torque, whole.valid)
+    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), white)
+    tests = None if white is None else RobotTests.of(pipeline, alone, white, whole.valid)
     # Methods 1 and 2 need no windows of the robot alone.
     shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
     in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
     loaded, rows, measured = regress_pair(pipeline, robot, recording)
     noise = column_noise(measured) if rows.noisy is None else np.sqrt((rows.noisy**2).mean(axis=0))
-    pair = _Pair(robot, robot_fit, in_windows, loaded)
+    pair = _Pair(robot, robot_fit, in_windows, loaded, tests)
     return _prepared(measured, rows, noise[len(robot.names) :], pair)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
-from jaximp.identification.suspects import of_arm, of_one_joint, remedy, untagged, what
+from jaximp.identification.separation import Separation
+from jaximp.identification.suspects import OF_MUSCLES, of_arm, of_one_joint, of_robot, remedy, untagged, what
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
@@ -30,10 +31,65 @@ def find_misfits(
     if recording.n_joints > 1:
         tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
         return tuple(_as_delayed(_one_after_another(tests)))
-    one_joint = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, len(rows.W)))
-    found = Tests.of(pipeline, white, rows.valid, one_joint)()
-    late = [_undelayed(one, pipeline.model.roles, theta) if one.group == "delay" else one for one in found]
-    return tuple(_as_delayed(late))
+    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
+    return _of_joint(pipeline, Tests.of(pipeline, white, rows.valid, groups)(), theta)
+
+
+def _of_joint(pipeline: Pipeline, found: Iterable[Misfit], theta: Numbers) -> tuple[Misfit, ...]:
+    roles = pipeline.model.roles
+    return tuple(_as_delayed([_undelayed(one, roles, theta) if is_delay(one.group) else one for one in found]))
+
+
+@dataclass(frozen=True)
+class RobotTests:
+    """What a robot's model lacks in the recording of the robot alone, with all of it as one window."""
+
+    columns: Mapping[str, NDArray[np.floating]]
+    """(N, g) of all suspects in this recording, behind the filters."""
+    weights: Mapping[str, NDArray[np.floating]]
+    """(r, g) with which the robot's own parameters imitate the columns that its model lacks."""
+    note: str
+    """What is missing, in words."""
+
+    @classmethod
+    def of(cls, pipeline: Pipeline, recording: Recording, white: White, valid: AnyArray) -> RobotTests:
+        """**Arguments:** the `recording` of the robot alone, its `white` rows, and which of them count (N,)."""
+        columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
+        tests = Tests.of(pipeline, white, valid, ((name, {0: one}) for name, one in columns.items()))
+        tests = replace(tests, window=len(tests.torque))
+        lacking, W = _suspected(tests()), tests.W[tests.valid]
+        weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
+        names = " or ".join(what(one.group) for one in lacking)
+        return cls(columns, weights, f"the model of the robot lacks {names}" if lacking else "")
+
+
+def find_human_misfits(
+    pipeline: Pipeline,
+    recording: Recording,
+    found: Separation,
+    theta: Numbers,
+    of_method: Callable[[tuple[AnyArray, AnyArray], AnyArray], Mapping[int, AnyArray]],
+    robot: RobotTests,
+) -> tuple[Misfit, ...]:
+    """Test the human's model in the white rows of a method, and what the robot's lacks for what it does to the human.
+
+    **Arguments:** the `recording` of the robot with the human; `theta` (h,) near which the human's parameters lie;
+    `of_method`, which knows what columns that the robot lacks leave in the rows (`robot_columns` of the method).
+    """
+    assert found.white is not None
+    n, human = len(found.torque), list(found.human)
+
+    def groups() -> Iterator[tuple[str, Mapping[int, Numbers]]]:
+        for name, columns in of_one_joint(pipeline, recording):
+            if name in robot.weights:
+                acting = of_method((robot.columns[name], columns), robot.weights[name])
+                yield of_robot(name), {output: one[:n] for output, one in acting.items()}
+            else:
+                yield name, {-1: columns[:n]}
+
+    tested = Tests.of(pipeline, found.white, found.valid, groups())()
+    own = (replace(one, move=one.move[human], stderr=one.stderr[human]) for one in tested)
+    return _of_joint(pipeline, own, theta)
 
 
 @dataclass(frozen=True)
@@ -85,7 +141,7 @@ class Tests:
 def _one_after_another(tests: Tests) -> list[Misfit]:
     """Every joint may lack something of its own: groups of other joints are tested beside those that explain most,
     which their columns may only imitate."""
-    found = {}
+    found: dict[str, Misfit] = {}
     names = list(tests.groups)
     while tests.groups:
         these = tests()
@@ -98,9 +154,14 @@ def _one_after_another(tests: Tests) -> list[Misfit]:
     return [found[name] for name in names if name in found]
 
 
+def is_delay(group: str) -> bool:
+    """Of whatever joint."""
+    return untagged(group)[0] == "delay"
+
+
 def _as_delayed(misfits: Sequence[Misfit]) -> list[Misfit]:
     """To slow motion whatever yields is a delay: that tells what it does to the parameters, its own weights do not."""
-    late = {one.group.replace("delay", "lag"): one for one in misfits if untagged(one.group)[0] == "delay"}
+    late = {one.group.replace("delay", "lag"): one for one in misfits if is_delay(one.group)}
     return [
         replace(one, move=late[one.group].move, stderr=late[one.group].stderr) if one.group in late else one
         for one in misfits
@@ -151,8 +212,8 @@ def off_by(
 
 def _suspected(misfits: Sequence[Misfit]) -> list[Misfit]:
     """Of every joint the group that explains most, and those that explain nearly as much; what explains less is not
-    needed."""
-    found = significant(misfits)
+    needed, nor what explains less than idle columns would."""
+    found = [one for one in significant(misfits) if one.evidence > 0]
     most = {untagged(one.group)[1]: one.evidence for one in reversed(found)}
     return [one for one in found if one.evidence >= ALIKE * most[untagged(one.group)[1]]]
 
@@ -187,12 +248,12 @@ def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) ->
 
 def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, str]:
     """Why these parameters cannot be trusted, and what to do; empty where none is off."""
-    return (in_words(misfits, off), remedy(significant(misfits)[0].group)) if off else ("", "")
+    return (in_words(misfits, off), remedy(_suspected(misfits)[0].group)) if off else ("", "")
 
 
 def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
     """What is missing, but moves no parameter beyond error and `SHARE`: a note."""
-    if not significant(misfits) or off_by(misfits, names, size, kinds):
+    if not _suspected(misfits) or off_by(misfits, names, size, kinds):
         return ""
     return f"the model lacks {culprits(misfits)}, which moves no parameter by more than {SHARE:.0%} or beyond error"
 

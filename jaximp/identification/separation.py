@@ -54,6 +54,10 @@ class Separation(eqx.Module):
     """The rows that estimates come from, of the recording with the human last; None where they are those given."""
     torque: Float[Array, " N"]
     """The torque that the human's model had to explain [N m] (for methods 2 and 4 that of method 1)."""
+    valid: AnyArray
+    """(N, *n) which of the rows that were solved count."""
+    human: tuple[int, ...] = eqx.field(static=True)
+    """Which of the parameters that were solved for are the human's."""
     warning: str = eqx.field(static=True, default="")
     """Why the method should not be believed here, or nothing."""
 
@@ -62,17 +66,16 @@ Whiten = Callable[[AnyArray, AnyArray, AnyArray], White]
 """White rows of columns, torque and which of them count."""
 
 
-def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None, whiten: Whiten | None = None) -> WindowFit:
+def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None, white: White | None = None) -> WindowFit:
     """Parameters of the robot from the whole recording R, as methods 1 and 2 begin.
 
-    **Arguments:** `noise` its autocovariance by lag in rows, or `whiten` where its shape is to be estimated.
+    **Arguments:** `noise` its autocovariance by lag in rows; `white` rows of it where its shape was estimated.
     """
     # Compiled in one piece: every operation for itself takes many times as long to compile.
     solve = jax.jit(least_squares)
-    if whiten is None:
+    if white is None:
         fit = solve(alone.robot, alone.torque, alone.valid, noise)
     else:
-        white = whiten(alone.robot, alone.torque, alone.valid)
         fit = with_sizes_of_one(solve(white.W, white.torque, alone.valid, None), white)
     if not bool(jnp.isfinite(fit.theta).all()):
         raise ValueError(
@@ -103,19 +106,37 @@ def separate(
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: the paper has methods 1, 2, 3 and 4")
     slide = _Slide(Partial(sliding_least_squares, window=window, step=step, noise=noise, room=room), whiten)
-    torque = loaded.torque - loaded.robot @ robot.theta
+    torque, n_human = loaded.torque - loaded.robot @ robot.theta, loaded.human.shape[1]
     if method == 1:
-        return Separation(*_robot_first(robot, loaded, torque, slide), torque)
+        return Separation(*_robot_first(robot, loaded, torque, slide), torque, loaded.valid, tuple(range(n_human)))
     if method == 2:
-        return Separation(*_difference_of_parameters(robot, loaded, merge, slide), torque)
+        human = tuple(np.argmax(np.asarray(merge), axis=0)[-n_human:].tolist())
+        return Separation(*_difference_of_parameters(robot, loaded, merge, slide), torque, loaded.valid, human)
     alone, loaded, shorter = _same_length(alone, loaded)
     if method == 3:
         torque = loaded.torque - alone.torque
         valid = alone.valid & loaded.valid
         fit, white = slide(loaded.human, torque, valid)
         warning = "; ".join(filter(None, [_motions_differ(robot, alone, loaded, torque), shorter]))
-        return Separation(fit, white, torque, warning)
-    return Separation(*_augmented(alone, loaded, slide), torque[: len(loaded.torque)], shorter)
+        return Separation(fit, white, torque, valid, tuple(range(n_human)), warning)
+    n_robot, valid = loaded.robot.shape[1], jnp.stack([alone.valid, loaded.valid], axis=1)
+    human, torque = tuple(range(n_robot, n_robot + n_human)), torque[: len(loaded.torque)]
+    return Separation(*_augmented(alone, loaded, slide), torque, valid, human, shorter)
+
+
+def robot_columns(
+    method: int, missing: tuple[AnyArray, AnyArray], weights: AnyArray, loaded: Regression
+) -> dict[int, AnyArray]:
+    """What columns that the robot's model lacks leave in the rows of a method, by the output on which they act.
+
+    **Arguments:** `missing` (N, g) in the recordings R and RH; `weights` (r, g) with which the robot's own parameters
+    imitate them in R, as methods 1 and 2 begin; `loaded` RH.
+    """
+    alone, held = missing
+    if method in (1, 2):
+        return {-1: held - np.asarray(loaded.robot) @ weights}
+    n = min(len(alone), len(held))
+    return {-1: held[:n] - alone[:n]} if method == 3 else {0: alone[:n], 1: held[:n]}
 
 
 @dataclass(frozen=True)

@@ -160,21 +160,30 @@ SCALE = Suspect(
 WORDS: Mapping[str, Suspect | OfTorque] = {**OF_JOINTS, **SUSPECTS, "gravity": GRAVITY, "scale": SCALE}
 
 
+ROBOT = "robot"
+
+
 def tag(name: str, joint: int) -> str:
     """The name of a group of one joint of several, counted from zero."""
     return f"joint {joint + 1}: {name}"
 
 
+def of_robot(name: str) -> str:
+    """The name of a group of the robot that holds a human."""
+    return f"{ROBOT}: {name}"
+
+
 def untagged(group: str) -> tuple[str, int | None]:
-    """Name, and joint counted from zero, of a group of one joint of several."""
-    joint, _, name = group.rpartition(": ")
-    return name, int(joint.split()[-1]) - 1 if joint else None
+    """Name, and joint counted from zero (of one joint of several), of a group."""
+    whose, _, name = group.rpartition(": ")
+    return name, int(whose.split()[-1]) - 1 if whose.startswith("joint") else None
 
 
 def what(group: str) -> str:
     """What a group stands for, in words: `dry friction of joint 2`."""
-    name, joint = untagged(group)
-    return WORDS[name].what if joint is None else f"{WORDS[name].what} of joint {joint + 1}"
+    whose, _, name = group.rpartition(": ")
+    owner = f"the {ROBOT}" if whose == ROBOT else whose
+    return f"{WORDS[name].what} of {owner}" if owner else WORDS[name].what
 
 
 def remedy(group: str) -> str:
@@ -186,11 +195,11 @@ def remedy(group: str) -> str:
 # --- columns -------------------------------------------------------------------------------------------------------
 
 
-def of_one_joint(pipeline: Pipeline, recording: Recording, rows: int) -> Iterator[tuple[str, Numbers]]:
+def of_one_joint(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, Numbers]]:
     """Columns (N, g) of all `SUSPECTS`, behind the filters."""
     (motion,) = motions(pipeline, recording)
     for name, suspect in SUSPECTS.items():
-        yield name, behind_filters(pipeline.filters, suspect.columns(motion), rows)
+        yield name, behind_filters(pipeline.filters, suspect.columns(motion))
 
 
 def of_arm(
@@ -206,7 +215,7 @@ def of_arm(
     for j, motion in enumerate(each):
         for name, suspect in OF_JOINTS.items():
             if muscles or name not in OF_MUSCLES:
-                yield tag(name, j), {j: behind_filters(filters, suspect.columns(motion), len(W))}
+                yield tag(name, j), {j: behind_filters(filters, suspect.columns(motion))}
         for name, by_torque in OF_TORQUES.items():
             yield tag(name, j), {j: np.stack(by_torque.columns(explained[j]), axis=1)}
     if pipeline.model.label == "arm":
@@ -216,17 +225,17 @@ def of_arm(
         shared = (np.abs(W) > 0).any(axis=0).all(axis=0)
         if shared.any():
             yield "scale", {1: np.asarray(W)[:, 1, shared]}
-        yield "gravity", {j: behind_filters(filters, columns[j], len(W)) for j in columns}
+        yield "gravity", {j: behind_filters(filters, columns[j]) for j in columns}
 
 
-def behind_filters(filters: Filters, columns: list[Numbers], rows: int) -> Numbers:
-    """(rows, g) of columns of every sample."""
+def behind_filters(filters: Filters, columns: list[Numbers]) -> Numbers:
+    """(N, g) rows of columns of every sample."""
     together = np.stack(columns, axis=1)
     if filters.parallel is not None:
         from scipy.signal import sosfiltfilt
 
         together = sosfiltfilt(np.array(filters.parallel), together, axis=0)
-    return np.asarray(together[:: filters.decimate][:rows])
+    return np.asarray(together[:: filters.decimate])
 
 
 def motions(pipeline: Pipeline, recording: Recording) -> list[Motion]:
