@@ -27,6 +27,7 @@ from jaximp.identification.misfit import (
     in_words,
     missing,
     off_by,
+    sizes,
     unnoticed,
 )
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
@@ -47,7 +48,8 @@ from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.criteria import fake_change_threshold
-from jaximp.trust.score_tests import Misfit, compare_bands
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.score_tests import Bands, Misfit, compare_bands
 from jaximp.trust.window_rules import judge_together, judged_names, measure_windows
 from jaximp.types import Progress, Recording, nearest
 
@@ -456,7 +458,7 @@ def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone:
     whitener = _whitener(pipeline)
     white = None if whitener is None else whitener(whole.robot, whole.torque, whole.valid)
     robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), white)
-    tests = None if white is None else RobotTests.of(pipeline, alone, white, whole.valid)
+    tests = None if whitener is None else RobotTests.of(pipeline, alone, whole, whitener)
     # Methods 1 and 2 need no windows of the robot alone.
     shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
     in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
@@ -499,47 +501,22 @@ def _estimates(
     misfits: tuple[Misfit, ...] = (),
 ) -> Estimates:
     """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
-    recording, pipeline, model = prepared.recording, prepared.pipeline, prepared.model
-    fit, unseen, whole = solved[:3]
-    starts = place.starts[: len(fit.last)]
-    held_out = np.where(np.asarray(unseen.variance) > STILL * whole.torque, np.asarray(unseen.vaf), np.nan)
-    # Methods 2 and 4 solve for more than the human, and white rows are other rows: the human's torque judges them all.
-    if method in (2, 4) or (method is not None and pipeline.whitens):
-        valid = jnp.asarray(rows.valid)
-        seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, _room(place))
-        quality = (seen.vaf, seen.residual_rms, seen.samples)
-        fit = eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
+    pipeline, model = prepared.pipeline, prepared.model
+    solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
+    fit, starts = solved.fit, place.starts[: len(solved.fit.last)]
+    held_out = _held_out(solved)
     threshold, why_not = _threshold(prepared, place, method)
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
-    limits, weights = pipeline.limits, {model.names[k] for reflex in reflexes for k in reflex.columns}
-    if reflexes and not limits.parameters:
-        # Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one.
-        kept = [name for name, role in zip(model.names, model.roles, strict=True) if role.kind != "offset"]
-        limits = replace(limits, parameters=tuple(name for name in kept if name not in weights))
-    full = place.counted * model.n_joints
-    measured = measure_windows(
-        fit, model.names, model.roles, full, whole.parameter_scale, prepared.column_noise, threshold, limits
-    )
+    weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
+    limits = _limits(pipeline, weights)
+    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits))
+    full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
+    measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
+    measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy)
+    measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
-    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown]
-    size = np.abs(np.nanmedian(np.asarray(fit.theta), axis=0)) if misfits else np.zeros(0)
-    of_model = (misfits, model.names, size, [role.kind for role in model.roles])
-    off, judged = off_by(*of_model), judged_names(model, limits)
-    why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
-    apart = -(-place.window // place.step) if not place.separate else max(1, int(place.next_starts[0] // place.window))
-    bands = None
-    if solved.ordinary is not None and misfits:
-        bands = compare_bands(*(np.asarray(x.theta)[::apart] for x in (solved.ordinary, fit)))
-    noise: tuple[NDArray[np.float64], ...] = ()
-    if prepared.white and curves:
-        row_rate = pipeline.sample_rate / pipeline.filters.decimate
-        noise = (prepared.white[0].noise_spectrum(row_rate, torque.reshape(reconstructed.shape) - reconstructed),)
-    differing = by_bands(bands, model.names, model.units)
-    others = [text for name, text in differing.items() if name in judged and name not in off]
-    why = "; ".join(filter(None, [why, *others]))
-    measured = replace(measured, tested=bool(misfits), missing=why, remedy=remedy)
-    measured = judge_together(measured, fit, model.roles, np.asarray(held_out), apart, limits)
-    jumps = jump_note(recording, prepared.jumps)
+    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown].reshape(reconstructed.shape)
+    about = (jump_note(prepared.recording, prepared.jumps), _literal_note(pipeline), why_not, *of_model.notes, *notes)
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -548,27 +525,96 @@ def _estimates(
         start=rows.time[starts],
         end=rows.time[np.asarray(fit.last)],
         fit=fit,
-        held_out_vaf=np.asarray(held_out),
+        held_out_vaf=held_out,
         measured=(measured,),
         limits=pipeline.limits,
         threshold=threshold,
         time=rows.time[shown],
-        torque=torque.reshape(reconstructed.shape),
+        torque=torque,
         reconstructed=reconstructed,
         predicted=predicted,
-        notes=(
-            *recording.notes,
-            *filter(None, (jumps, _literal_note(pipeline), why_not, harmless(*of_model), unnoticed(*of_model), *notes)),
-        ),
+        notes=(*prepared.recording.notes, *filter(None, about)),
         reflexes=reflexes,
         misfits=misfits,
-        bands=bands,
-        noise=noise,
-        lacking={name: text for name, text in differing.items() if name not in weights}
-        | {name: in_words(misfits, {name: share}) for name, share in off.items() if name not in weights},
+        bands=of_model.bands,
+        noise=_noise_spectra(prepared, torque - reconstructed) if curves else (),
+        lacking={name: text for name, text in of_model.lacking.items() if name not in weights},
     )
-    about = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
-    return replace(estimates, notes=estimates.notes + about) if about else estimates
+    of_reflexes = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
+    return replace(estimates, notes=estimates.notes + of_reflexes) if of_reflexes else estimates
+
+
+def _judged_by_the_human(
+    pipeline: Pipeline, rows: Rows, fit: SlidingFit, place: Placement, method: int | None
+) -> SlidingFit:
+    """Methods 2 and 4 solve for more than the human, and white rows are other rows: the human's torque judges all."""
+    if method is None or not (method in (2, 4) or pipeline.whitens):
+        return fit
+    starts, valid = place.starts[: len(fit.last)], jnp.asarray(rows.valid)
+    seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, _room(place))
+    quality = (seen.vaf, seen.residual_rms, seen.samples)
+    return eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
+
+
+def _held_out(solved: Solved) -> NDArray[np.float64]:
+    """(M,) how each window predicts the next; NaN where that one hardly has a torque."""
+    unseen = solved.unseen
+    return np.where(np.asarray(unseen.variance) > STILL * solved.moments.torque, np.asarray(unseen.vaf), np.nan)
+
+
+def _limits(pipeline: Pipeline, weights: set[str]) -> TrustLimits:
+    """Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one."""
+    limits, model = pipeline.limits, pipeline.model
+    if not weights or limits.parameters:
+        return limits
+    kept = [name for name, role in zip(model.names, model.roles, strict=True) if role.kind != "offset"]
+    return replace(limits, parameters=tuple(name for name in kept if name not in weights))
+
+
+def _apart(place: Placement) -> int:
+    """Windows so far from each other share no rows."""
+    if place.separate:
+        return max(1, int(place.next_starts[0] // place.window))
+    return -(-place.window // place.step)
+
+
+def _noise_spectra(prepared: Prepared, left: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Of the noise that was estimated, by what the estimates leave (N, n) of the torque."""
+    if not prepared.white:
+        return ()
+    row_rate = prepared.pipeline.sample_rate / prepared.pipeline.filters.decimate
+    return (prepared.white[0].noise_spectrum(row_rate, left),)
+
+
+@dataclass(frozen=True)
+class _OfModel:
+    """What the tests say of the model."""
+
+    why: str
+    """Why parameters that are judged cannot be trusted."""
+    remedy: str
+    lacking: dict[str, str]
+    """Why each parameter cannot be trusted."""
+    bands: Bands | None
+    notes: tuple[str, str]
+
+    @classmethod
+    def of(
+        cls, model: Model, solved: Solved, misfits: tuple[Misfit, ...], place: Placement, judged: Sequence[str]
+    ) -> _OfModel:
+        theta = np.asarray(solved.fit.theta)
+        size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
+        tests = (misfits, model.names, size, [role.kind for role in model.roles])
+        off, bands = off_by(*tests), None
+        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
+        if solved.ordinary is not None and misfits:
+            apart = _apart(place)
+            bands = compare_bands(np.asarray(solved.ordinary.theta)[::apart], theta[::apart])
+        lacking = by_bands(bands, model.names, model.units)
+        others = [text for name, text in lacking.items() if name in judged and name not in off]
+        lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
+        why = "; ".join(filter(None, [why, *others]))
+        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests)))
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

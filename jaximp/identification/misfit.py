@@ -10,8 +10,17 @@ from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
-from jaximp.identification.separation import Separation
-from jaximp.identification.suspects import OF_MUSCLES, of_arm, of_one_joint, of_robot, remedy, untagged, what
+from jaximp.identification.separation import Regression, Separation, Whiten
+from jaximp.identification.suspects import (
+    OF_MUSCLES,
+    has_muscles,
+    of_arm,
+    of_one_joint,
+    of_robot,
+    remedy,
+    untagged,
+    what,
+)
 from jaximp.identification.whitening import White
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
@@ -19,6 +28,11 @@ from jaximp.types import AnyArray, Numbers, Recording, listed
 
 HIDES = {"lag": "stiffness"}
 """Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
+
+
+FEWEST_WINDOWS = 6
+"""In a shorter record a machine's parameters are taken as those of the record: windows with parameters of their own
+would leave nothing to test with."""
 
 
 def find_misfits(
@@ -30,6 +44,8 @@ def find_misfits(
     """
     if recording.n_joints > 1:
         tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
+        if not has_muscles(pipeline.model) and len(tests.torque) < FEWEST_WINDOWS * tests.window:
+            tests = replace(tests, window=len(tests.torque))
         return tuple(_as_delayed(_one_after_another(tests)))
     groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
     return _of_joint(pipeline, Tests.of(pipeline, white, rows.valid, groups)(), theta)
@@ -52,11 +68,16 @@ class RobotTests:
     """What is missing, in words."""
 
     @classmethod
-    def of(cls, pipeline: Pipeline, recording: Recording, white: White, valid: AnyArray) -> RobotTests:
-        """**Arguments:** the `recording` of the robot alone, its `white` rows, and which of them count (N,)."""
+    def of(cls, pipeline: Pipeline, recording: Recording, alone: Regression, whiten: Whiten) -> RobotTests:
+        """**Arguments:** the `recording` of the robot alone, and as `alone` its rows.
+
+        The noise is what the suspects leave of the torque too: friction that is missing turns as slowly as slow noise,
+        and would hide behind it.
+        """
         columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
-        tests = Tests.of(pipeline, white, valid, ((name, {0: one}) for name, one in columns.items()))
-        tests = replace(tests, window=len(tests.torque))
+        white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
+        tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
+        tests = replace(tests, W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque))
         lacking, W = _suspected(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
@@ -185,6 +206,18 @@ def _undelayed(misfit: Misfit, roles: Sequence[Role], theta: Numbers) -> Misfit:
             move[place[of]] += late * (moved[place[by]] if by == "stiffness" else theta[place[by]] + move[place[by]])
     relative = np.max(misfit.stderr / np.where(misfit.move != 0, np.abs(misfit.move), np.inf), initial=0.0)
     return replace(misfit, move=move, stderr=relative * np.abs(move))
+
+
+def sizes(usual: Numbers, roles: Sequence[Role]) -> Numbers:
+    """(p,) with which moves of parameters of this usual size are compared; what couples two joints may be small, and
+    counts by the geometric mean of both joints' own."""
+    own = {(role.kind, role.element): size for role, size in zip(roles, usual, strict=True)}
+    found = usual.copy()
+    for k, (kind, element) in enumerate(roles):
+        if len(element) == 2:
+            joints = [own.get((kind, (j, j)), 0.0) for j in element]
+            found[k] = max(usual[k], np.sqrt(joints[0] * joints[1]))
+    return found
 
 
 def off_by(

@@ -11,6 +11,7 @@ from jaximp import signals
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import measured_motion
+from jaximp.models.base import Model
 from jaximp.types import AnyArray, Numbers, Recording
 
 REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
@@ -133,7 +134,9 @@ def _reworded(name: str, remedy: str) -> Suspect:
 OF_JOINTS: Mapping[str, Suspect] = {
     "reflex": _reworded("reflex", "perturb less, or more briefly than a reflex takes"),
     "stiffness": SUSPECTS["stiffness"],
-    "friction": _reworded("friction", "model it (coulomb = true), or leave out slow samples (window.min_velocity)"),
+    "friction": _reworded(
+        "friction", "model it (coulomb = true), or leave out more slow samples (window.min_velocity)"
+    ),
     "viscous": Suspect("viscous friction", "model it (viscous = true)", lambda m: [m.dq]),
     "rotor": Suspect("a motor's inertia", "model it (rotor = true), and leave out lengths", lambda m: [m.ddq]),
     "offset": Suspect("a constant torque", "model it (offset = true)", lambda m: [np.ones_like(m.t)]),
@@ -195,6 +198,11 @@ def remedy(group: str) -> str:
 # --- columns -------------------------------------------------------------------------------------------------------
 
 
+def has_muscles(model: Model) -> bool:
+    """Whether a model is of more than a machine or a limp arm."""
+    return any(role.kind == "stiffness" for role in model.roles)
+
+
 def of_one_joint(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, Numbers]]:
     """Columns (N, g) of all `SUSPECTS`, behind the filters."""
     (motion,) = motions(pipeline, recording)
@@ -210,7 +218,7 @@ def of_arm(
     **Arguments:** `W` (N, n, p) rows as they were filtered, and the parameters `theta` (p,), near which it lies.
     """
     filters, each = pipeline.filters, motions(pipeline, recording)
-    muscles = any(role.kind == "stiffness" for role in pipeline.model.roles)
+    muscles = has_muscles(pipeline.model)
     explained = _explained(pipeline, np.asarray(W) @ theta)
     for j, motion in enumerate(each):
         for name, suspect in OF_JOINTS.items():
