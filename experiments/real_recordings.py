@@ -204,6 +204,7 @@ def pendulum() -> dict[str, Any]:
         "residual": float(np.linalg.norm(residual) / np.linalg.norm(np.concatenate([t[v] for _, t, v in parts]))),
         "residual_of_the_file_that_was_held_out": held_out,
         "windows_of_5_s_of_the_last_file": estimates.verdicts.counts(),
+        "lacking": dict(estimates.lacking),
     }
 
 

@@ -1,4 +1,4 @@
-"""The simulated ankles of the experiments."""
+"""The simulated ankles and arms of the experiments."""
 
 import importlib
 from collections.abc import Iterator
@@ -15,3 +15,11 @@ def ankles() -> Iterator[ModuleType]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "experiments")
         yield importlib.import_module("ankles")
+
+
+@pytest.fixture(scope="session")
+def arms() -> Iterator[ModuleType]:
+    """Module experiments/arms.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "experiments")
+        yield importlib.import_module("arms")

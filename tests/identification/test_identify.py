@@ -219,8 +219,8 @@ min_velocity = 0.1
 
 @pytest.mark.slow
 def test_the_double_pendulum_is_near_its_owners_own_fit(data_folder: Path) -> None:
-    """Windows of one file; all four together stand in experiments/real_recordings.py."""
-    estimates = identify(parse_job(PENDULUM, data_folder))[0]
+    """Windows of one file by ordinary least squares; all four together stand in experiments/real_recordings.py."""
+    estimates = identify(parse_job(PENDULUM + 'noise = "filtered"', data_folder))[0]
     found = dict(zip(estimates.names, estimates.mean_over_trusted(), strict=True))
     assert estimates.verdicts.trusted.mean() > 0.7
     assert found["inertia_1"] - found["inertia_3"] == pytest.approx(0.1106, rel=0.15)
@@ -228,6 +228,15 @@ def test_the_double_pendulum_is_near_its_owners_own_fit(data_folder: Path) -> No
     assert found["inertia_3"] == pytest.approx(0.0239, rel=0.15)
     assert found["gravity_1"] == pytest.approx(0.3491, rel=0.15)
     assert estimates.torque.shape[1] == 2
+
+
+@pytest.mark.slow
+def test_the_friction_of_the_double_pendulum_is_not_what_its_model_says(data_folder: Path) -> None:
+    """Joint 2 hardly moves in this file, and its friction is larger than its torque."""
+    estimates = identify(parse_job(PENDULUM, data_folder))[0]
+    assert not estimates.trusted.any()
+    assert "gravity_2" in estimates.lacking
+    assert "dry friction of joint 2" in estimates.lacking["gravity_2"]
 
 
 def arm_recording(stiffness: np.ndarray, noise: float = 0.01) -> Recording:
