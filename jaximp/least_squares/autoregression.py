@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Num, Shaped
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 
 from jaximp.types import AnyArray, Numbers
 
 ORDERS = (0, 2, 4, 8, 16, 32)
 """Of autoregressions that are tried, one after the other."""
-FIRST_ORDERS, WORSE = 4, 6.0
-"""Order up to which sums are prepared at first, and how much worse the criterion may become before no higher order is
-tried."""
+WORSE = 6.0
+"""How much worse the criterion may become before no higher order is tried."""
 ROWS_PER_TERM = 4
 """A window has so many independent rows for each term of the autoregression, at least."""
 FEWEST_WINDOWS = 20
@@ -33,6 +33,8 @@ LOST = 1e-10
 """A direction of a window's columns with a smaller share of their squares is left out: nothing is known of it."""
 LONGEST, NOTHING_MORE = 16, 0.001
 """Order of an autoregression of known noise, and the share of the error beyond it that is not worth more terms."""
+BLOCK, AT_ONCE = 32, 1 << 16
+"""Rows that are whitened by one row of a product, and numbers in one product, about."""
 SETTLED = 1e-5
 """Slope of the logarithm of the likelihood, per independent row, at which the search ends."""
 ROUNDING = 1e-15
@@ -101,22 +103,24 @@ def autoregression_of(autocovariance: Num[AnyArray, " L"], every: int = 1) -> Au
 
 
 class _Sums(NamedTuple):
-    """What the likelihood of K windows needs to know of their rows."""
+    """What the likelihood of K windows needs to know of their rows, in columns that are orthonormal in each window.
 
-    products: Numbers
-    """(K, P + 1, P + 1, q + 1, q + 1) of rows some lags apart, in coordinates in which columns are orthonormal."""
+    The quadratic form of an autoregression a is that of the lagged products, as if rows stood before and behind every
+    run and were zero, less what these rows would leave of the first and of the last ones.
+    """
+
+    lagged: Numbers
+    """(P + 1, K, q + 1, q + 1) products of rows some lags apart, either way; at lag zero once."""
+    ends: Numbers
+    """(P, E, q + 1) the first and the last P rows of every run, from its end inwards."""
+    owner: NDArray[np.int64]
+    """(E,) the windows that they belong to, in order."""
     missing: Numbers
     """(K, q) one where a direction is left out, else zero."""
     runs: Numbers
     """(K,) stretches without a gap."""
     freedom: Numbers
     """(K,) independent rows less parameters."""
-
-    @property
-    def order(self) -> int:
-        """Highest order that they serve, P."""
-        return self.products.shape[1] - 1
-
 
 def fit_window_noise(
     W: Num[AnyArray, "N p"],
@@ -145,12 +149,11 @@ def fit_window_noise(
     if len(orders) < 2:
         return Autoregression(every=every)
     z = np.column_stack([W, y])
-    sums, best, start = None, (np.inf, np.zeros(0)), np.zeros(0)
+    sums = _sums(z, stretches, orders[-1], every)
+    if sums is None:
+        return Autoregression(every=every)
+    best, start = (np.inf, np.zeros(0)), np.zeros(0)
     for order in orders:
-        if sums is None or sums.order < order:
-            sums = _sums(z, stretches, min(orders[-1], max(4 * order, FIRST_ORDERS)), every, orders[-1])
-        if sums is None:
-            break
         start, value = _fit(sums, np.pad(start, (0, order - len(start))))
         small = rows / (rows - order - 1)  # Hurvich and Tsai 1989, for few rows
         criterion = value + 2 * order * small
@@ -167,23 +170,50 @@ def whiten_rows(
 
     The first rows after a gap are predicted from as many as there are, and weighted as exactly as they are known.
     """
-    valid = np.asarray(valid, bool)
+    valid, order = np.asarray(valid, bool), noise.order
     z = np.where(valid.reshape(-1, *(1,) * (np.ndim(z) - 1)), np.asarray(z, float), 0)
-    if not noise.order:
+    if not order:
         return z
-    known = np.minimum(_rows_before(valid, noise.every), noise.order)
-    table = np.zeros((noise.order + 1, noise.order + 1))
-    left = np.append(np.cumprod((1 - noise.reflections**2)[::-1])[::-1], 1)
-    for k, polynomial in enumerate(_polynomials(noise.reflections)):
+    columns = z.reshape(len(z), -1)
+    white = _convolved(columns, noise.polynomial, noise.every)
+    white[~valid] = 0
+    known = np.minimum(_rows_before(valid, noise.every), order)
+    first = np.flatnonzero(valid & (known < order))
+    table = np.zeros((order, order))
+    left = np.cumprod((1 - noise.reflections**2)[::-1])[::-1]
+    for k, polynomial in enumerate(_polynomials(noise.reflections)[:-1]):
         table[k, : k + 1] = np.sqrt(left[k]) * polynomial
-    white = np.zeros_like(z)
-    for j in range(noise.order + 1):
-        behind = j * noise.every
-        if behind >= len(z):
-            break
-        weight = np.where(valid, table[known, j], 0)[behind:]
-        white[behind:] += weight.reshape(-1, *(1,) * (z.ndim - 1)) * z[: len(z) - behind]
-    return white
+    behind = noise.every * np.arange(order)
+    for some in np.array_split(first, 1 + first.size * order * columns.shape[1] // AT_ONCE):
+        before = columns[np.maximum(some[:, None] - behind, 0)]
+        white[some] = (table[known[some], None] @ before)[:, 0]
+    return white.reshape(z.shape)
+
+
+def _convolved(columns: Numbers, polynomial: Numbers, every: int) -> Numbers:
+    """(N, k) sums of each row and those before it in steps of `every`, weighted: many rows by one matrix."""
+    (n, k), order = columns.shape, len(polynomial) - 1
+    size = max(order, BLOCK)
+    reach, all_blocks = order * every, -(-n // (size * every))
+    blocks = -(-all_blocks // -(-all_blocks * size * every * k // AT_ONCE))
+    weights = np.zeros((order + size, size))
+    for behind, weight in enumerate(polynomial):
+        np.fill_diagonal(weights[order - behind :], weight)
+    padded = np.zeros((k, every, order + blocks * size))
+    around = sliding_window_view(padded, order + size, axis=2)[:, :, ::size]
+    found = np.empty((k, n))
+    for first in range(0, n, blocks * size * every):
+        piece = columns[max(0, first - reach) : first + blocks * size * every].T
+        before = reach - min(first, reach)
+        for phase in range(every):
+            own = piece[:, phase::every]
+            padded[:, phase, before // every :][:, : own.shape[1]] = own
+            padded[:, phase, before // every + own.shape[1] :] = 0
+        white = (around.reshape(-1, order + size) @ weights).reshape(k, every, -1)
+        for phase in range(every):
+            place = found[:, first + phase : first + blocks * size * every : every]
+            place[:] = white[:, phase, : place.shape[1]]
+    return found.T
 
 
 def _rows_before(valid: NDArray[np.bool_], every: int) -> NDArray[np.int64]:
@@ -215,53 +245,65 @@ def _usual_run(stretches: list[list[NDArray[np.int64]]]) -> int:
     return int(lengths[np.searchsorted(np.cumsum(lengths), lengths.sum() / 2)]) if len(lengths) else 0
 
 
-def _sums(
-    z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, every: int, highest: int = 0
-) -> _Sums | None:
+def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, every: int) -> _Sums | None:
     """Of the windows that say something of noise of this order; None where there is none.
 
-    Orders compare by the same rows only: `highest` is the last that will be tried, if it is above this one.
+    Lower orders are found in them too: orders compare by the same rows only.
     """
-    highest = max(order, highest)
     q, kept = z.shape[1] - 1, []
     size = np.sqrt((z**2).mean(axis=0))
     z = z / np.where(size > 0, size, 1)
     for runs in stretches:
         # The quadratic form of the likelihood holds for runs of at least twice the order.
-        runs = [run for run in runs if len(run) > 2 * highest]
-        if sum(map(len, runs)) > (2 * q + highest) * every and any(z[run, q].any() for run in runs):
+        runs = [run for run in runs if len(run) > 2 * order]
+        if sum(map(len, runs)) > (2 * q + order) * every and any(z[run, q].any() for run in runs):
             kept.append(runs)
     if not kept:
         return None
-    products = np.zeros((len(kept), order + 1, order + 1, q + 1, q + 1))
-    by_length: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
-    for k, runs in enumerate(kept):
-        for run in runs:
-            by_length.setdefault(len(run), []).append((k, run))
-    for members in by_length.values():
-        owners, index = zip(*members, strict=True)
-        np.add.at(products, list(owners), _lagged_products(z[np.stack(index)], order))
-    rows = np.array([sum(map(len, runs)) for runs in kept]) / every
-    to_orthonormal, missing = _orthonormal(products[:, 0, 0, :q, :q])
-    basis = np.zeros((len(kept), q + 1, q + 1))
-    basis[:, :q, :q], basis[:, q, q] = to_orthonormal, 1
-    across = basis[:, None, None]
-    products = across.swapaxes(-1, -2) @ products @ across
-    freedom = rows - q + missing.sum(axis=1)
-    return _Sums(products, missing, np.array([len(runs) for runs in kept], float) / every, freedom)
+    owner = np.repeat(np.arange(len(kept)), [len(runs) for runs in kept])
+    alike: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
+    for k, run in zip(owner.tolist(), (run for runs in kept for run in runs), strict=True):
+        alike.setdefault(len(run), []).append((k, run))
+    groups = [(np.array([k for k, _ in members]), np.stack([run for _, run in members])) for members in alike.values()]
+    gram = np.zeros((len(kept), q, q))
+    for of, index in groups:
+        W = z[index, :q]
+        np.add.at(gram, of, W.swapaxes(1, 2) @ W)
+    basis, missing = np.zeros((len(kept), q + 1, q + 1)), np.zeros((len(kept), q))
+    basis[:, :q, :q], missing = _orthonormal(gram)
+    basis[:, q, q] = 1
+    lagged, ends = np.zeros((order + 1, len(kept), q + 1, q + 1)), np.zeros((order, 2, len(owner), q + 1))
+    done = 0
+    for of, index in groups:
+        for some in np.array_split(np.arange(len(of)), 1 + index.size * (q + 1) ** 2 // AT_ONCE):
+            rows = z[index[some]] @ basis[of[some]]
+            np.add.at(lagged, (slice(None), of[some]), _lagged_products(rows, order))
+            ends[:, :, done : done + len(some)] = np.stack([rows[:, :order], rows[:, :-order-1:-1]]).transpose(2, 0, 1, 3)
+            done += len(some)
+    by_owner = np.argsort(np.tile(np.concatenate([of for of, _ in groups]), 2), kind="stable")
+    rows_of = np.array([sum(map(len, runs)) for runs in kept]) / every
+    return _Sums(
+        lagged=lagged,
+        ends=ends.reshape(order, -1, q + 1)[:, by_owner],
+        owner=np.repeat(owner, 2),
+        missing=missing,
+        runs=np.array([len(runs) for runs in kept], float) / every,
+        freedom=rows_of - q + missing.sum(axis=1),
+    )
 
 
 def _lagged_products(z: Numbers, order: int) -> Numbers:
-    """(K, P + 1, P + 1, q, q) sums over t of z[i + t] z[j + t]' with t from 0 to n - 1 - i - j, of K runs of n rows."""
-    runs, n, q = z.shape
-    found = np.zeros((runs, order + 1, order + 1, q, q))
-    for lag in range(order + 1):
-        total = np.einsum("kta,ktb->kab", z[:, : n - lag], z[:, lag:])
-        for i in range(order + 1 - lag):
-            found[:, i, i + lag] = total
-            found[:, i + lag, i] = total.swapaxes(1, 2)
-            for first in (i, n - 1 - i - lag):  # the outermost pair at either end leaves
-                total = total - z[:, first, :, None] * z[:, first + lag, None, :]
+    """(P + 1, K, q, q) sums over t of z[t] z[t + lag]' and its transpose, of K runs of n rows; at lag zero once."""
+    from scipy.fft import next_fast_len
+
+    q, size = z.shape[2], next_fast_len(z.shape[1] + order, real=True)
+    spectrum = np.fft.rfft(z, size, axis=1).transpose(2, 0, 1)
+    one, other = np.triu_indices(q)
+    power = spectrum.real[one] * spectrum.real[other] + spectrum.imag[one] * spectrum.imag[other]
+    products = np.fft.irfft(power, size)[..., : order + 1]
+    products[..., 1:] *= 2
+    found = np.empty((order + 1, len(z), q, q))
+    found[..., one, other] = found[..., other, one] = products.transpose(2, 1, 0)
     return found
 
 
@@ -277,15 +319,13 @@ def _fit(sums: _Sums, start: Numbers) -> tuple[Numbers, float]:
     """(k,) reflections with the largest restricted likelihood, and minus twice its logarithm up to a constant."""
     from scipy.optimize import minimize
 
-    order = len(start)
-    products = sums.products[:, : order + 1, : order + 1]
-    if not order:
-        return start, _likelihood(start, products, sums)[0]
+    if not len(start):
+        return start, _likelihood(start, sums)[0]
     count = sums.freedom.sum()
 
     def objective(u: Numbers) -> tuple[float, Numbers]:
         reflections = NEARLY_ONE * np.tanh(u)
-        value, slope = _likelihood(reflections, products, sums)
+        value, slope = _likelihood(reflections, sums)
         return value / count, slope * NEARLY_ONE * (1 - np.tanh(u) ** 2) / count
 
     first = np.arctanh(np.clip(start, -FARTHEST_START, FARTHEST_START))
@@ -293,26 +333,57 @@ def _fit(sums: _Sums, start: Numbers) -> tuple[Numbers, float]:
     return NEARLY_ONE * np.tanh(found.x), float(found.fun * count)
 
 
-def _likelihood(reflections: Numbers, products: Numbers, sums: _Sums) -> tuple[float, Numbers]:
+def _likelihood(reflections: Numbers, sums: _Sums) -> tuple[float, Numbers]:
     """Minus twice the logarithm of the restricted likelihood of all windows, and its derivatives."""
-    q = products.shape[-1] - 1
+    order, (windows, q) = len(reflections), sums.missing.shape
     a, slopes = _polynomial_and_slopes(reflections)
-    half = np.tensordot(products, a, (2, 0))
-    whole = np.tensordot(half, a, (1, 0))
+    lagged, ends = sums.lagged[: order + 1].reshape(order + 1, -1), sums.ends[:order]
+    whole = (np.correlate(a, a, "full")[order:] @ lagged).reshape(windows, q + 1, q + 1)
+    if order:
+        whole -= _left_of_ends(a, ends, sums.owner)
     rounding = ROUNDING * np.abs(a).sum() ** 2
     gram = whole[:, :q, :q] + (sums.missing[:, :, None] + rounding) * np.eye(q)
     inverse = np.linalg.inv(gram)
     theta = (inverse @ whole[:, :q, q:])[..., 0]
-    floor = 1e-28 * products[:, 0, 0, q, q]  # data without noise
+    floor = 1e-28 * sums.lagged[0, :, q, q]  # data without noise
     rss = np.maximum(whole[:, q, q] - (whole[:, :q, q] * theta).sum(axis=1), 0) + floor
-    residual = np.concatenate([-theta, np.ones((len(theta), 1))], axis=1)
-    of_rss = 2 * ((half @ residual[:, None, :, None])[..., 0] * residual[:, None]).sum(axis=-1)
-    of_gram = 2 * (inverse[:, None] * half[:, :, :q, :q]).sum(axis=(-1, -2))
-    lags = np.arange(1, len(reflections) + 1)
+    runs, lags = sums.runs.sum(), np.arange(1, order + 1)
     value = (sums.freedom * np.log(rss) + np.linalg.slogdet(gram)[1]).sum()
-    value -= sums.runs.sum() * (lags * np.log1p(-(reflections**2))).sum()
-    slope = (of_rss * (sums.freedom / rss)[:, None] + of_gram).sum(axis=0) @ slopes
-    return float(value), slope + sums.runs.sum() * 2 * lags * reflections / (1 - reflections**2)
+    value -= runs * (lags * np.log1p(-(reflections**2))).sum()
+    residual = np.concatenate([-theta, np.ones((windows, 1))], axis=1)
+    weights = residual[:, :, None] * residual[:, None] * (sums.freedom / rss)[:, None, None]
+    weights[:, :q, :q] += inverse
+    curvature = _weighted(weights, lagged, ends, sums.owner)
+    slope = slopes.T @ (curvature @ a) + runs * 2 * lags * reflections / (1 - reflections**2)
+    return float(value), slope
+
+
+def _left_of_ends(a: Numbers, ends: Numbers, owner: NDArray[np.int64]) -> Numbers:
+    """(K, q + 1, q + 1) products of what an autoregression a would leave of the rows behind every end."""
+    order = len(a) - 1
+    ahead = np.concatenate([a[1:], np.zeros(order - 1)])
+    left = sliding_window_view(ahead, order) @ ends.reshape(order, -1)
+    left = left.reshape(ends.shape).swapaxes(0, 1)
+    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    return np.add.reduceat(left.swapaxes(1, 2) @ left, first)
+
+
+def _weighted(weights: Numbers, lagged: Numbers, ends: Numbers, owner: NDArray[np.int64]) -> Numbers:
+    """(k + 1, k + 1) second derivatives, by an autoregression, of its quadratic form with these weights of the sums."""
+    order = len(ends)
+    by_lag = lagged @ weights.ravel()
+    by_lag[0] *= 2
+    found = by_lag[np.abs(np.arange(order + 1)[:, None] - np.arange(order + 1))]
+    if order:
+        of_ends = (ends.swapaxes(0, 1) @ weights[owner]).swapaxes(0, 1).reshape(order, -1) @ ends.reshape(order, -1).T
+        # Entry i, j sums all entries before it along the diagonal, which a shift by one in every row makes a column.
+        shifted = np.zeros((order, 2 * order - 1))
+        step = shifted.itemsize
+        diagonals = as_strided(shifted.ravel()[order - 1 :], (order, order), ((2 * order - 2) * step, step))
+        diagonals[:] = of_ends
+        np.cumsum(shifted, axis=0, out=shifted)
+        found[1:, 1:] -= 2 * diagonals
+    return found
 
 
 def _polynomials(reflections: Numbers) -> list[Numbers]:
@@ -326,9 +397,12 @@ def _polynomials(reflections: Numbers) -> list[Numbers]:
 
 def _polynomial_and_slopes(reflections: Numbers) -> tuple[Numbers, Numbers]:
     """(k + 1,) the polynomial, and (k + 1, k) its derivatives by the reflections."""
-    a, slopes = np.ones(1), np.zeros((1, len(reflections)))
-    for m, reflection in enumerate(reflections):
-        longer, steeper = np.append(a, 0), np.vstack([slopes, np.zeros(len(reflections))])
-        a, slopes = longer + reflection * longer[::-1], steeper + reflection * steeper[::-1]
-        slopes[:, m] += longer[::-1]
-    return a, slopes
+    order = len(reflections)
+    found = np.zeros((order + 1, order + 1))
+    found[0, order] = 1
+    for m, reflection in enumerate(reflections.tolist()):
+        longer = found[: m + 2]
+        turned = longer[::-1].copy()
+        longer += reflection * turned
+        longer[:, m] = turned[:, order]
+    return found[:, order], found[:, :order]

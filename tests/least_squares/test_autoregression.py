@@ -92,7 +92,7 @@ def test_the_restricted_likelihood_is_that_of_the_covariance_matrix() -> None:
         return total
 
     def computed(noise: Autoregression) -> float:
-        return _likelihood(noise.reflections, sums.products, sums)[0]
+        return _likelihood(noise.reflections, sums)[0]
 
     other = Autoregression(np.array([0.3, -0.6, 0.1]))
     assert computed(NOISE) - computed(other) == pytest.approx(written_out(NOISE) - written_out(other), abs=1e-8)
@@ -102,10 +102,9 @@ def test_the_slopes_of_the_likelihood_are_differences() -> None:
     (W, y), reflections = rows(200), np.array([0.4, -0.3, 0.2])
     sums = _sums(np.column_stack([W, y]), _stretches(np.ones(200, bool), 50, 1), 3, 1)
     assert sums is not None
-    products = sums.products
-    slopes = _likelihood(reflections, products, sums)[1]
+    slopes = _likelihood(reflections, sums)[1]
     for k, unit in enumerate(np.eye(3)):
-        high, low = (_likelihood(reflections + sign * 1e-6 * unit, products, sums)[0] for sign in (1, -1))
+        high, low = (_likelihood(reflections + sign * 1e-6 * unit, sums)[0] for sign in (1, -1))
         assert slopes[k] == pytest.approx((high - low) / 2e-6, rel=1e-6)
 
 
@@ -129,7 +128,7 @@ def test_what_the_parameters_took_is_given_back() -> None:
         sums = _sums(np.column_stack([W, y]), _stretches(valid, 30, 1), 1, 1)
         assert sums is not None
         grid = np.linspace(-0.99, -0.6, 40)
-        found.append(grid[np.argmin([_likelihood(np.array([one]), sums.products, sums)[0] for one in grid])])
+        found.append(grid[np.argmin([_likelihood(np.array([one]), sums)[0] for one in grid])])
     assert np.mean(found) == pytest.approx(-0.95, abs=0.02)
 
 
@@ -157,9 +156,8 @@ def test_a_long_step_of_the_search_ends_nothing() -> None:
     sums = _sums(z, _stretches(np.ones(4000, bool), 200, 1), 8, 1)
     assert sums is not None
     for order in (2, 4, 8):
-        products = sums.products[:, : order + 1, : order + 1]
         for signs in random.choice([-1, 1], size=(40, order)):
-            value, slopes = _likelihood(NEARLY_ONE * signs, products, sums)
+            value, slopes = _likelihood(NEARLY_ONE * signs, sums)
             assert np.isfinite([value, *slopes]).all()
 
 
