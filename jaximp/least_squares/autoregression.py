@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Num, Shaped
-from numpy.lib.stride_tricks import as_strided, sliding_window_view
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from jaximp.types import AnyArray, Numbers
@@ -35,6 +35,9 @@ LONGEST, NOTHING_MORE = 16, 0.001
 """Order of an autoregression of known noise, and the share of the error beyond it that is not worth more terms."""
 BLOCK, AT_ONCE = 32, 1 << 16
 """Rows that are whitened by one row of a product, and numbers in one product, about."""
+MOST_STEPS, LONGEST_STEP, NOTHING_LEFT = 7, 2.0, 1e-8
+"""Newton's steps, how far each may go, and twice what the next one may gain of the logarithm of the likelihood when
+they end."""
 SETTLED = 1e-5
 """Slope of the logarithm of the likelihood, per independent row, at which the search ends."""
 ROUNDING = 1e-15
@@ -121,6 +124,7 @@ class _Sums(NamedTuple):
     """(K,) stretches without a gap."""
     freedom: Numbers
     """(K,) independent rows less parameters."""
+
 
 def fit_window_noise(
     W: Num[AnyArray, "N p"],
@@ -278,7 +282,9 @@ def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, ever
         for some in np.array_split(np.arange(len(of)), 1 + index.size * (q + 1) ** 2 // AT_ONCE):
             rows = z[index[some]] @ basis[of[some]]
             np.add.at(lagged, (slice(None), of[some]), _lagged_products(rows, order))
-            ends[:, :, done : done + len(some)] = np.stack([rows[:, :order], rows[:, :-order-1:-1]]).transpose(2, 0, 1, 3)
+            ends[:, :, done : done + len(some)] = np.stack([rows[:, :order], rows[:, : -order - 1 : -1]]).transpose(
+                2, 0, 1, 3
+            )
             done += len(some)
     by_owner = np.argsort(np.tile(np.concatenate([of for of, _ in groups]), 2), kind="stable")
     rows_of = np.array([sum(map(len, runs)) for runs in kept]) / every
@@ -317,24 +323,58 @@ def _orthonormal(gram: Numbers) -> tuple[Numbers, Numbers]:
 
 def _fit(sums: _Sums, start: Numbers) -> tuple[Numbers, float]:
     """(k,) reflections with the largest restricted likelihood, and minus twice its logarithm up to a constant."""
-    from scipy.optimize import minimize
-
     if not len(start):
         return start, _likelihood(start, sums)[0]
+    first = np.arctanh(np.clip(start, -FARTHEST_START, FARTHEST_START))
+    return _straight(sums, first) or _searched(sums, first)
+
+
+def _straight(sums: _Sums, u: Numbers) -> tuple[Numbers, float] | None:
+    """By Newton's steps in u, Fisher's transform of the reflections; None where they do not lead straight to it."""
+    least, last = np.inf, 0.0
+    for _ in range(MOST_STEPS):
+        reflections = NEARLY_ONE * np.tanh(u)
+        value, slope, curvature = _likelihood(reflections, sums, curved=True)
+        inside = 1 - reflections**2
+        slope, curvature = slope * inside, curvature * inside * inside[:, None]
+        if value >= least or not _definite(curvature):
+            break
+        step = -np.linalg.solve(curvature, slope)
+        if np.abs(step).max() > LONGEST_STEP:
+            break
+        gain, u = float(-slope @ step), u + step
+        if gain**2 < NOTHING_LEFT * max(gain, last):  # the next step gains no larger share of this one's
+            return NEARLY_ONE * np.tanh(u), value - gain / 2
+        least, last = value, gain
+    return None
+
+
+def _definite(curvature: Numbers) -> bool:
+    try:
+        np.linalg.cholesky(curvature)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _searched(sums: _Sums, u: Numbers) -> tuple[Numbers, float]:
+    """The same by a search along lines."""
+    from scipy.optimize import minimize
+
     count = sums.freedom.sum()
 
     def objective(u: Numbers) -> tuple[float, Numbers]:
         reflections = NEARLY_ONE * np.tanh(u)
-        value, slope = _likelihood(reflections, sums)
+        value, slope, _ = _likelihood(reflections, sums)
         return value / count, slope * NEARLY_ONE * (1 - np.tanh(u) ** 2) / count
 
-    first = np.arctanh(np.clip(start, -FARTHEST_START, FARTHEST_START))
-    found = minimize(objective, first, jac=True, method="BFGS", options={"maxiter": 200, "gtol": SETTLED})
+    found = minimize(objective, u, jac=True, method="BFGS", options={"maxiter": 200, "gtol": SETTLED})
     return NEARLY_ONE * np.tanh(found.x), float(found.fun * count)
 
 
-def _likelihood(reflections: Numbers, sums: _Sums) -> tuple[float, Numbers]:
-    """Minus twice the logarithm of the restricted likelihood of all windows, and its derivatives."""
+def _likelihood(reflections: Numbers, sums: _Sums, curved: bool = False) -> tuple[float, Numbers, Numbers]:
+    """Minus twice the logarithm of the restricted likelihood of all windows, its derivatives, and if wanted the second
+    ones, nearly."""
     order, (windows, q) = len(reflections), sums.missing.shape
     a, slopes = _polynomial_and_slopes(reflections)
     lagged, ends = sums.lagged[: order + 1].reshape(order + 1, -1), sums.ends[:order]
@@ -347,22 +387,43 @@ def _likelihood(reflections: Numbers, sums: _Sums) -> tuple[float, Numbers]:
     theta = (inverse @ whole[:, :q, q:])[..., 0]
     floor = 1e-28 * sums.lagged[0, :, q, q]  # data without noise
     rss = np.maximum(whole[:, q, q] - (whole[:, :q, q] * theta).sum(axis=1), 0) + floor
-    runs, lags = sums.runs.sum(), np.arange(1, order + 1)
-    value = (sums.freedom * np.log(rss) + np.linalg.slogdet(gram)[1]).sum()
-    value -= runs * (lags * np.log1p(-(reflections**2))).sum()
+    runs, lags, inside = sums.runs.sum(), np.arange(1, order + 1), 1 - reflections**2
+    value = (sums.freedom * np.log(rss) + np.linalg.slogdet(gram)[1]).sum() - runs * (lags * np.log(inside)).sum()
     residual = np.concatenate([-theta, np.ones((windows, 1))], axis=1)
-    weights = residual[:, :, None] * residual[:, None] * (sums.freedom / rss)[:, None, None]
+    share = sums.freedom / rss
+    weights = residual[:, :, None] * residual[:, None] * share[:, None, None]
     weights[:, :q, :q] += inverse
     curvature = _weighted(weights, lagged, ends, sums.owner)
-    slope = slopes.T @ (curvature @ a) + runs * 2 * lags * reflections / (1 - reflections**2)
-    return float(value), slope
+    slope = slopes.T @ (curvature @ a) + runs * 2 * lags * reflections / inside
+    if not curved:
+        return float(value), slope, curvature
+    curvature -= _of_windows(a, lagged, residual, inverse, share, rss)
+    curvature = slopes.T @ curvature @ slopes + np.diag(runs * 2 * lags * (1 + reflections**2) / inside**2)
+    return float(value), slope, curvature
+
+
+def _of_windows(
+    a: Numbers, lagged: Numbers, residual: Numbers, inverse: Numbers, share: Numbers, rss: Numbers
+) -> Numbers:
+    """(k + 1, k + 1) by which second derivatives are smaller since windows choose size and parameters for themselves."""
+    order, q = len(a) - 1, inverse.shape[1]
+    lag, padded = np.arange(order + 1), np.concatenate([np.zeros(order), a, np.zeros(order)])
+    around = padded[lag[:, None] - lag + order] + padded[lag[:, None] + lag + order]
+    slopes = (around @ lagged).reshape(order + 1, -1, q + 1, q + 1)  # of the sums of every window, but for ends of runs
+    of_residual = (slopes @ residual[:, :, None])[..., 0]
+    of_rss = (of_residual * residual).sum(axis=-1)
+    across = (of_residual[:, :, None, :q] @ (2 * share[:, None, None] * inverse))[:, :, 0]
+    of_gram = inverse @ slopes[..., :q, :q]
+    found = (of_rss * share / rss) @ of_rss.T
+    found += of_gram.reshape(order + 1, -1) @ of_gram.swapaxes(2, 3).reshape(order + 1, -1).T
+    return found + across.reshape(order + 1, -1) @ of_residual[:, :, :q].reshape(order + 1, -1).T
 
 
 def _left_of_ends(a: Numbers, ends: Numbers, owner: NDArray[np.int64]) -> Numbers:
     """(K, q + 1, q + 1) products of what an autoregression a would leave of the rows behind every end."""
     order = len(a) - 1
-    ahead = np.concatenate([a[1:], np.zeros(order - 1)])
-    left = sliding_window_view(ahead, order) @ ends.reshape(order, -1)
+    ahead, steps = np.append(a[1:], np.zeros(order - 1)), np.arange(order)
+    left = ahead[steps[:, None] + steps] @ ends.reshape(order, -1)
     left = left.reshape(ends.shape).swapaxes(0, 1)
     first = np.flatnonzero(np.diff(owner, prepend=-1))
     return np.add.reduceat(left.swapaxes(1, 2) @ left, first)
@@ -376,12 +437,12 @@ def _weighted(weights: Numbers, lagged: Numbers, ends: Numbers, owner: NDArray[n
     found = by_lag[np.abs(np.arange(order + 1)[:, None] - np.arange(order + 1))]
     if order:
         of_ends = (ends.swapaxes(0, 1) @ weights[owner]).swapaxes(0, 1).reshape(order, -1) @ ends.reshape(order, -1).T
-        # Entry i, j sums all entries before it along the diagonal, which a shift by one in every row makes a column.
-        shifted = np.zeros((order, 2 * order - 1))
-        step = shifted.itemsize
-        diagonals = as_strided(shifted.ravel()[order - 1 :], (order, order), ((2 * order - 2) * step, step))
+        # Entry i, j sums all before it along its diagonal: a column, where every row is shifted by one more.
+        shifted = np.zeros(2 * order**2)
+        diagonals = shifted[order - 1 : -1].reshape(order, -1)[:, :order]
         diagonals[:] = of_ends
-        np.cumsum(shifted, axis=0, out=shifted)
+        columns = shifted.reshape(order, -1)
+        np.cumsum(columns, axis=0, out=columns)
         found[1:, 1:] -= 2 * diagonals
     return found
 
