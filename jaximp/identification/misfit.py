@@ -22,6 +22,7 @@ from jaximp.identification.suspects import (
     what,
 )
 from jaximp.identification.whitening import White
+from jaximp.least_squares.disjoint import DisjointFit
 from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording, listed
@@ -45,7 +46,7 @@ def find_misfits(
     if recording.n_joints > 1:
         tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
         if not has_muscles(pipeline.model) and len(tests.torque) < FEWEST_WINDOWS * tests.window:
-            tests = replace(tests, window=len(tests.torque))
+            tests = replace(tests, window=len(tests.torque), fit=None)
         return tuple(_as_delayed(_one_after_another(tests)))
     groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
     return _of_joint(pipeline, Tests.of(pipeline, white, rows.valid, groups)(), theta)
@@ -77,7 +78,7 @@ class RobotTests:
         columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
         white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
         tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
-        tests = replace(tests, W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque))
+        tests = replace(tests, W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque), fit=None)
         lacking, W = _suspected(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
@@ -123,6 +124,8 @@ class Tests:
     groups: Mapping[str, Numbers]
     window: int
     every: int
+    fit: DisjointFit | None = None
+    """Of these rows in windows side by side, where it is known."""
 
     @classmethod
     def of(
@@ -139,11 +142,11 @@ class Tests:
                 columns[:, j] = white.apply(acting, counts[:, j], j)
             whole[name] = columns.reshape(-1, columns.shape[-1])
         W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
-        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every)
+        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every, white.windows)
 
     def __call__(self) -> list[Misfit]:
         """Test every group."""
-        return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every)
+        return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every, self.fit)
 
     def without(self, found: Sequence[Misfit]) -> Tests:
         """Of the groups of other joints, with all that these groups of one joint explain taken off the torque."""
@@ -156,7 +159,7 @@ class Tests:
         }
         columns = np.concatenate([self.groups[name] for name in sorted(gone)], axis=1)
         (together,) = replace(self, groups={"together": columns})()
-        return replace(self, torque=self.torque - columns @ together.weights, groups=others)
+        return replace(self, torque=self.torque - columns @ together.weights, groups=others, fit=None)
 
 
 def _one_after_another(tests: Tests) -> list[Misfit]:

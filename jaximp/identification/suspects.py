@@ -43,8 +43,13 @@ class Motion:
         return np.concatenate([np.zeros(lag), x[: len(x) - lag]])
 
     def twitch(self, x: Numbers, seconds: float) -> Numbers:
-        """The torque of a muscle that is told x."""
-        return yielding(yielding(x, seconds, self.rate), seconds, self.rate)
+        """The torque of a muscle that is told x; of no seconds, x itself."""
+        from scipy.signal import lfilter
+
+        if not seconds:
+            return x
+        a = np.exp(-1 / (seconds * self.rate))
+        return np.asarray(lfilter([(1 - a) ** 2], [1, -2 * a, a * a], x))
 
 
 @dataclass(frozen=True)
@@ -57,10 +62,10 @@ class Suspect:
 
 
 def yielding(x: Numbers, seconds: float, rate: float) -> Numbers:
-    """x behind a first-order lag; of no seconds, x itself."""
+    """x behind a first-order lag."""
     from scipy.signal import lfilter
 
-    a = np.exp(-1 / (seconds * rate)) if seconds else 0.0
+    a = np.exp(-1 / (seconds * rate))
     return np.asarray(lfilter([1 - a], [1, -a], x))
 
 
@@ -206,8 +211,10 @@ def has_muscles(model: Model) -> bool:
 def of_one_joint(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, Numbers]]:
     """Columns (N, g) of all `SUSPECTS`, behind the filters."""
     (motion,) = motions(pipeline, recording)
-    for name, suspect in SUSPECTS.items():
-        yield name, behind_filters(pipeline.filters, suspect.columns(motion))
+    by_group = [suspect.columns(motion) for suspect in SUSPECTS.values()]
+    together = behind_filters(pipeline.filters, [column for group in by_group for column in group])
+    ends = np.cumsum([len(group) for group in by_group])
+    yield from zip(SUSPECTS, np.split(together, ends[:-1], axis=1), strict=True)
 
 
 def of_arm(
@@ -238,12 +245,10 @@ def of_arm(
 
 def behind_filters(filters: Filters, columns: list[Numbers]) -> Numbers:
     """(N, g) rows of columns of every sample."""
-    together = np.stack(columns, axis=1)
-    if filters.parallel is not None:
-        from scipy.signal import sosfiltfilt
-
-        together = sosfiltfilt(np.array(filters.parallel), together, axis=0)
-    return np.asarray(together[:: filters.decimate])
+    together = np.stack(columns)
+    if filters.parallel is None:
+        return together[:, :: filters.decimate].T
+    return np.asarray(signals.filter_zero_phase_decimated(filters.parallel, together, filters.decimate)).T
 
 
 def motions(pipeline: Pipeline, recording: Recording) -> list[Motion]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
 from jaximp.least_squares.autoregression import Autoregression, autoregression_of, fit_window_noise, whiten_rows
+from jaximp.least_squares.disjoint import DisjointFit, fit_disjoint
 from jaximp.least_squares.sliding import Score
 from jaximp.least_squares.window import SlidingFit, WindowFit
 from jaximp.types import AnyArray, Numbers
@@ -26,6 +28,8 @@ FREQUENCIES = 256
 """Of a spectrum that is shown."""
 FEWEST_ROWS = 200
 """Independent rows of all windows from which a scatter of their scores is judged."""
+LEAST_LEFT = 1e-3
+"""A row's residual is taken for such a share of its error at least, however much of it the parameters took."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class White:
     """Of each output, what is left where that is taken off."""
     size: Numbers
     """(n,) by what each output was divided."""
+    windows: DisjointFit
+    """Least squares of the white rows in windows side by side, of all outputs together."""
     inflation: Numbers
     """(p,) by what standard errors grow since the noise's size follows the motion; one where it does not."""
 
@@ -98,22 +104,24 @@ def whiten(pipeline: Pipeline, rows: Rows) -> White:
     def white(z: AnyArray, noise: Sequence[Autoregression]) -> NDArray[np.float64]:
         return np.stack([whiten_rows(z[:, j], valid[:, j], noise[j]) for j in range(outputs)], axis=1)
 
-    columns = [W, y, *([] if rows.noisy is None else [rows.noisy.reshape(W.shape)])]
-    W, y, *noisy = (white(z, [filtered] * outputs) for z in columns)
-    noise = tuple(fit_window_noise(W[:, j], y[:, j], valid[:, j], window, every) for j in range(outputs))
-    W, y, *noisy = (white(z, noise) for z in (W, y, *noisy))
-    size = _sizes(W, y, valid, window)
-    W, y = W / size[:, None], y / size
-    shape = rows.torque.shape
-    inflation = _inflation(W.reshape(-1, W.shape[-1]), y.ravel(), valid.ravel(), window * outputs, every)
+    p, noisy = W.shape[-1], [] if rows.noisy is None else [rows.noisy.reshape(W.shape)]
+    z = white(np.concatenate([W, y[..., None], *noisy], axis=-1), [filtered] * outputs)
+    noise = tuple(fit_window_noise(z[:, j, :p], z[:, j, p], valid[:, j], window, every) for j in range(outputs))
+    z = white(z, noise)
+    size = _sizes(z[..., :p], z[..., p], valid, window)
+    z = z / size[:, None]
+    W, y, shape = np.ascontiguousarray(z[..., :p]), np.ascontiguousarray(z[..., p]), rows.torque.shape
+    flat = W.reshape(-1, p), y.ravel()
+    windows = fit_disjoint(*flat, valid.ravel(), window * outputs)
     return White(
         W=W.reshape(*shape, -1),
         torque=y.reshape(shape),
-        noisy=(noisy[0] / size[:, None]).reshape(*shape, -1) if noisy else None,
+        noisy=z[..., p + 1 :].reshape(*shape, -1) if noisy else None,
         filtered=filtered,
         noise=noise,
         size=size,
-        inflation=inflation,
+        windows=windows,
+        inflation=_inflation(flat[0], windows, every),
     )
 
 
@@ -122,52 +130,30 @@ def _sizes(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int) -> Num
     outputs = y.shape[1]
     if outputs == 1:
         return np.ones(1)
-    left = np.array([
-        sum(_left(W[part, j], y[part, j], valid[part, j]) for part in _parts(len(y), window))
-        for j in range(outputs)
-    ])  # fmt: skip
+    parts = [slice(first, first + window) for first in range(0, len(y) - window + 1, window)]
+    left = np.zeros(outputs)
+    for part, j in product(parts, range(outputs)):
+        left[j] += ((y[part, j] - W[part, j] @ np.linalg.lstsq(W[part, j], y[part, j])[0]) ** 2).sum()
     size = np.sqrt(left / np.maximum(valid.sum(axis=0), 1))
     return np.where(size > 0, size, 1) / (size[0] if size[0] > 0 else 1)
 
 
-def _parts(n: int, window: int) -> list[slice]:
-    """Windows side by side."""
-    return [slice(first, first + window) for first in range(0, n - window + 1, window)]
-
-
-def _left(W: Numbers, y: Numbers, valid: NDArray[np.bool_]) -> float:
-    """Sum of squares that ordinary least squares leaves."""
-    theta = np.linalg.lstsq(W[valid], y[valid])[0]
-    return float(((y - W @ theta)[valid] ** 2).sum())
-
-
-def _inflation(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int, every: int) -> Numbers:
+def _inflation(W: Numbers, windows: DisjointFit, every: int) -> Numbers:
     """(p,) root of the variance that the scatter of scores gives over the textbook's, of windows side by side.
 
     **Source:** White 1980; residuals scaled by their leverage, MacKinnon and White 1985 (HC2).
     """
-    p, ratios, weights = W.shape[1], [], []
-    for part in _parts(len(y), window):
-        rows, torque = W[part][valid[part]], y[part][valid[part]]
-        if len(rows) < (p + 2) * every:
-            continue
-        Q, R = np.linalg.qr(rows)
-        diagonal = np.abs(np.diagonal(R))
-        if diagonal.min() <= 1e-10 * diagonal.max():
-            continue
-        residual = torque - Q @ (Q.T @ torque)
-        freedom = len(rows) - p
-        if not residual @ residual > 0:
-            continue
-        scores = Q * (residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), 1e-3)))[:, None]
-        inverse = np.linalg.inv(R)
-        robust = ((scores @ inverse.T) ** 2).sum(axis=0)
-        plain = (inverse**2).sum(axis=1) * (residual @ residual) / freedom
-        ratios.append(robust / plain)
-        weights.append(freedom / every)
-    if sum(weights) < FEWEST_ROWS:
+    p, freedom = W.shape[1], windows.rows - W.shape[1]
+    ratios, chosen = [], np.flatnonzero(windows.sound & (windows.rows >= (p + 2) * every))
+    if freedom[chosen].sum() / every < FEWEST_ROWS:
         return np.ones(p)
-    return np.sqrt(np.average(ratios, axis=0, weights=weights))
+    for k in chosen:
+        Q, residual, inverse = windows.orthonormal(W, slice(k, k + 1))[0], windows.residual[k], windows.inverse[k]
+        scores = Q * (residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT)))[:, None]
+        robust = (inverse @ (scores.T @ scores) * inverse).sum(axis=1)
+        plain = (inverse**2).sum(axis=1) * (residual @ residual) / freedom[k]
+        ratios.append(robust / plain)
+    return np.sqrt(np.average(ratios, axis=0, weights=freedom[chosen]))
 
 
 def from_white(fit: SlidingFit, ordinary: SlidingFit, white: White, seen: Score | None = None) -> SlidingFit:

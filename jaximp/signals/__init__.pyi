@@ -18,6 +18,7 @@ from .filters import cut_signal as cut_signal
 from .filters import filter_from_zero as filter_from_zero
 from .filters import filter_in_windows as filter_in_windows
 from .filters import filter_zero_phase as filter_zero_phase
+from .filters import filter_zero_phase_decimated as filter_zero_phase_decimated
 from .filters import filter_zero_phase_padded as filter_zero_phase_padded
 from .filters import kept_variance as kept_variance
 from .filters import padded_filter as padded_filter

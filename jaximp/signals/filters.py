@@ -24,6 +24,8 @@ Sections = NDArray[np.float64] | tuple[tuple[float, ...], ...]
 """Second-order sections (k, 6): an array, or plain numbers by which compiled code can be found again."""
 BLOCK = 64
 """Samples that a filter takes in one product."""
+DECIMATED = 160
+"""Samples of which one product makes what is kept of them, about."""
 SLOW = 5.0
 """Sample rate at which nobody records a motion [Hz]: milliseconds that were read as seconds."""
 
@@ -83,6 +85,83 @@ def filter_zero_phase_padded(
     y = _filter(filters.sos, filters.rest, jnp.concatenate([start, end]), backward=False)[edge:]
     y = _filter(filters.sos, filters.rest, reversed_from_end(y), backward=False)
     return reversed_from_end(y)[:-edge]
+
+
+def filter_zero_phase_decimated(
+    sos: tuple[tuple[float, ...], ...], x: Num[AnyArray, "k N"], every: int
+) -> Float[AnyArray, "k M"]:
+    """Every so many samples of `filter_zero_phase` of signals with time on axis 1, by numpy.
+
+    What stands between them is worked out nowhere: a block of samples makes, by one matrix, what is kept of it and
+    what it leaves in the filter, forward and backward.
+
+    **Raises:** `ValueError` if there are too few samples for the extension.
+    """
+    from scipy.signal import sosfilt, sosfilt_zi
+
+    sections = np.asarray(sos, np.float64)
+    edge, rest = _edge_within(sections, x.shape[1]), sosfilt_zi(sections)
+    start, end = 2 * x[:, :1] - x[:, edge:0:-1], 2 * x[:, -1:] - x[:, -2 : -edge - 2 : -1]
+    by = _decimation(sos, every)
+    blocks = x.shape[1] // by.size
+    tail = np.concatenate([x[:, blocks * by.size :], end], axis=1)
+
+    def at_rest(first: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.multiply.outer(rest, first).swapaxes(1, 2)
+
+    m, states = by.after.shape[0], sosfilt(sections, start, zi=at_rest(start[:, 0]))[1]
+    of_blocks = (x[:, : blocks * by.size].reshape(len(x), blocks, by.size) @ by.of_samples).swapaxes(0, 1)
+    states, forward = states.swapaxes(0, 1).reshape(-1, m), np.empty((blocks, len(x), m))
+    for k in range(blocks):
+        forward[k], states = states, states @ by.after + of_blocks[k, :, :m]
+    of_blocks[..., m:] += forward @ by.of_forward
+    states = states.reshape(-1, len(sections), 2).swapaxes(0, 1)
+    tail = sosfilt(sections, tail, zi=states)[0][:, ::-1]
+    tail, states = sosfilt(sections, tail, zi=at_rest(tail[:, 0]))
+    states, backward = states.swapaxes(0, 1).reshape(-1, m), np.empty((blocks, len(x), m))
+    for k in range(blocks)[::-1]:
+        backward[k], states = states, states @ by.after + of_blocks[k, :, m : 2 * m]
+    kept = (of_blocks[..., 2 * m :] + backward @ by.of_backward).swapaxes(0, 1).reshape(len(x), -1)
+    return np.concatenate([kept, tail[:, : edge - 1 : -1][:, ::every]], axis=1)
+
+
+class _Decimation(NamedTuple):
+    """Matrices of a filter with m states that runs over blocks of `size` samples, forward and then backward."""
+
+    size: int
+    of_samples: NDArray[np.float64]
+    """(size, m + m + kept) what the samples of a block leave in the states, forward and backward, and in what is kept
+    of the block."""
+    of_forward: NDArray[np.float64]
+    """(m, m + kept) what the states before a block leave in those of the way back, and in what is kept."""
+    of_backward: NDArray[np.float64]
+    """(m, kept) what the states behind a block leave in what is kept."""
+    after: NDArray[np.float64]
+    """(m, m) what becomes of states over a block."""
+
+
+@lru_cache(maxsize=64)
+def _decimation(sos: tuple[tuple[float, ...], ...], every: int) -> _Decimation:
+    from scipy.signal import sosfilt
+
+    sections = np.asarray(sos, np.float64)
+    size, m = every * max(1, DECIMATED // every), 2 * len(sections)
+
+    def run(x: NDArray[np.float64], states: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        y, left = sosfilt(sections, x, zi=states.reshape(len(x), -1, 2).swapaxes(0, 1))
+        return y, left.swapaxes(0, 1).reshape(len(x), m)
+
+    samples, states = run(np.eye(size), np.zeros((size, m)))
+    decay, after = run(np.zeros((m, size)), np.eye(m))
+    places = np.arange(size - 1, -1, -every)  # of what is kept, on the way back
+    leaves = np.concatenate([states, samples[:, places]], axis=1)
+    return _Decimation(
+        size,
+        np.concatenate([states, samples[:, ::-1] @ leaves], axis=1),
+        decay[:, ::-1] @ leaves,
+        decay[:, places],
+        after,
+    )
 
 
 class PaddedFilter(eqx.Module):

@@ -6,13 +6,14 @@ the parameters, are those of the fit with the added columns (Frisch, Waugh and L
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp.least_squares.disjoint import DisjointFit, fit_disjoint
 from jaximp.types import Numbers
 
 FAMILYWISE = 0.01
@@ -21,6 +22,8 @@ ERRORS, SHARE = 2.0, 0.05
 """A parameter is off where it would move by so many errors of the move, and by such a share of itself."""
 ALIKE = 0.85
 """A group that explains such a share of what the best one does looks like it."""
+MOST_LEVERAGE = 0.9
+"""Of a row that its window's parameters follow closely, by which its residual is scaled."""
 FEWEST_COMPARED = 6
 """Windows side by side whose estimates by ordinary and by generalised least squares are compared."""
 STILL = 0.1
@@ -48,79 +51,94 @@ class Misfit:
     """(p,) of that."""
 
 
-class _Window(NamedTuple):
-    """One window's fit."""
+class _Sums(NamedTuple):
+    """Of all windows that have a say, and of G added columns less what the model's own say of them."""
 
-    part: NDArray[np.int64]
-    Q: Numbers
-    inverse: Numbers
-    residual: Numbers
-    scale: float
-    weight: Numbers
+    gram: Numbers
+    """(G, G) of the columns."""
+    spread: Numbers
+    """(G, G) covariance of the scores, by the residuals of their own rows."""
+    score: Numbers
+    """(G,)"""
+    passed: Numbers
+    """(p, G) what a column adds to the parameters, on the mean over the windows."""
+    size: Numbers
+    """(G,) root of the sum of squares of the columns themselves."""
     freedom: float
-    excitation: Numbers
 
 
 def score_groups(
-    W: Numbers, y: Numbers, groups: Mapping[str, Numbers], valid: NDArray[np.bool_], window: int, every: int = 1
+    W: Numbers,
+    y: Numbers,
+    groups: Mapping[str, Numbers],
+    valid: NDArray[np.bool_],
+    window: int,
+    every: int = 1,
+    fit: DisjointFit | None = None,
 ) -> list[Misfit]:
     """Test every group of added columns.
 
     **Arguments:** `W` (N, p) and `y` (N,) rows whose noise is white; `groups` of further columns (N, g) that went
-    through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one.
+    through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one;
+    `fit` of W and y in these windows, where it is known.
 
     **Source:** score test with a covariance that knows nothing of the noise's size row by row (White 1980; residuals
     scaled by their leverage).
     """
-    windows = _excited(list(_windows(W, y, valid, window, every)))
-    found = (_test(name, columns, windows, every, W.shape[1]) for name, columns in groups.items())
+    if not valid.all():
+        W, y = np.where(valid[:, None], W, 0), np.where(valid, y, 0)
+        groups = {name: np.where(valid[:, None], columns, 0) for name, columns in groups.items()}
+    fit = fit_disjoint(W, y, valid, window) if fit is None else fit
+    sums = _sums(W, np.concatenate([columns.T for columns in groups.values()]), fit, every)
+    found, first = [], 0
+    for name, columns in groups.items():
+        own = slice(first, first := first + columns.shape[1])
+        found.append(_test(name, sums, own))
     return [one for one in found if one is not None]
 
 
-def _windows(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int, every: int) -> Iterator[_Window]:
-    p = W.shape[1]
-    for first in range(0, len(y) - window + 1, window):
-        part = first + np.flatnonzero(valid[first : first + window])
-        freedom = len(part) / every - p
-        if freedom < p:
-            continue
-        Q, R = np.linalg.qr(W[part])
-        diagonal = np.abs(np.diagonal(R))
-        residual = y[part] - Q @ (Q.T @ y[part])
-        scale = float(residual @ residual) / (freedom * every)
-        if diagonal.min() <= 1e-10 * diagonal.max() or scale <= 0:
-            continue
-        leverage = np.minimum((Q**2).sum(axis=1), 0.9)
-        yield _Window(part, Q, np.linalg.inv(R), residual, scale, 1 / np.sqrt(1 - leverage), freedom, diagonal)
+def _with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
+    """Windows that are determined, and move enough against the others that their parameters are not free to go
+    anywhere."""
+    p = fit.inverse.shape[1]
+    sound = np.flatnonzero(fit.sound & (fit.rows / every - p >= max(p, 1)))
+    if not len(sound):
+        return sound
+    usual = np.quantile(fit.excitation[sound], 0.75, axis=0)
+    return sound[(fit.excitation[sound] > STILL * usual).all(axis=1)]
 
 
-def _excited(windows: list[_Window]) -> list[_Window]:
-    """Without those that move so little against the others that their parameters are free to go anywhere."""
-    if not windows:
-        return []
-    usual = np.quantile([one.excitation for one in windows], 0.75, axis=0)
-    return [one for one in windows if (one.excitation > STILL * usual).all()]
+def _sums(W: Numbers, columns: Numbers, fit: DisjointFit, every: int) -> _Sums:
+    """Of columns (G, N)."""
+    (count, p), window, g = fit.excitation.shape, fit.residual.shape[1], len(columns)
+    by_window = columns[:, : fit.span].reshape(g, count, window).swapaxes(0, 1)
+    chosen = _with_say(fit, every)
+    freedom = fit.rows[chosen] / every - p
+    scale = fit.rss[chosen] / (freedom * every)
+    gram, spread, score, passed, size = np.zeros((g, g)), np.zeros((g, g)), np.zeros(g), np.zeros((p, g)), np.zeros(g)
+    for k, variance in zip(chosen.tolist(), scale.tolist(), strict=True):
+        Q, z, residual = fit.orthonormal(W, slice(k, k + 1))[0], by_window[k], fit.residual[k]
+        within = z @ Q
+        rest = z - within @ Q.T
+        gram += rest @ rest.T / variance
+        score += rest @ residual / variance
+        leverage = np.minimum((Q**2).sum(axis=1), MOST_LEVERAGE)
+        rest *= residual / np.sqrt(1 - leverage)
+        spread += rest @ rest.T * (every / variance**2)
+        passed += fit.inverse[k] @ within.T / len(chosen)
+        size += np.einsum("gt,gt->g", z, z) / variance
+    return _Sums(gram, spread, score, passed, np.sqrt(size), float(freedom.sum()))
 
 
-def _test(name: str, columns: Numbers, windows: Sequence[_Window], every: int, p: int) -> Misfit | None:
+def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
     from scipy.stats import f
 
-    size = np.sqrt(sum((columns[one.part] ** 2).sum(axis=0) / one.scale for one in windows))
-    columns = columns / np.where(size > 0, size, 1)
-    g = columns.shape[1]
-    gram, spread, score, passed = np.zeros((g, g)), np.zeros((g, g)), np.zeros(g), np.zeros((p, g))
-    for one in windows:
-        z = columns[one.part]
-        within = one.Q.T @ z
-        rest = z - one.Q @ within
-        gram += rest.T @ rest / one.scale
-        score += rest.T @ one.residual / one.scale
-        rows = rest * (one.residual * one.weight / one.scale)[:, None]
-        spread += rows.T @ rows * every
-        passed += one.inverse @ within / len(windows)
+    size = np.where(sums.size[own] > 0, sums.size[own], 1)
+    gram, spread = (x[own, own] / size / size[:, None] for x in (sums.gram, sums.spread))
+    score, passed, freedom = sums.score[own] / size, sums.passed[:, own] / size, sums.freedom
     values, vectors = np.linalg.eigh(gram)
-    kept = vectors[:, values > LOST * max(values[-1], np.finfo(float).tiny)] if len(windows) else vectors[:, :0]
-    freedom, k = sum(one.freedom for one in windows), kept.shape[1]
+    kept = vectors[:, values > LOST * max(values[-1], np.finfo(float).tiny)]
+    k = kept.shape[1]
     if not k or values[-1] < LOST or freedom <= 2 * k:
         return None
     gram, spread, score, passed = kept.T @ gram @ kept, kept.T @ spread @ kept, kept.T @ score, passed @ kept
@@ -132,7 +150,7 @@ def _test(name: str, columns: Numbers, windows: Sequence[_Window], every: int, p
         p=float(f.sf(statistic / k, k, freedom - k)),
         statistic=statistic,
         evidence=statistic - k * np.log(freedom),
-        weights=kept @ weights / np.where(size > 0, size, 1),
+        weights=kept @ weights / size,
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),
     )

@@ -157,7 +157,7 @@ def test_a_long_step_of_the_search_ends_nothing() -> None:
     assert sums is not None
     for order in (2, 4, 8):
         for signs in random.choice([-1, 1], size=(40, order)):
-            value, slopes = _likelihood(NEARLY_ONE * signs, sums)
+            value, slopes, _ = _likelihood(NEARLY_ONE * signs, sums)
             assert np.isfinite([value, *slopes]).all()
 
 
