@@ -74,15 +74,15 @@ SUSPECTS: Mapping[str, Suspect] = {
         "a stretch reflex",
         "try model.human.reflex = true",
         lambda m: [
-            m.twitch(m.later(np.maximum(sign * m.dq, 0), REFLEX_DELAY), seconds)
-            for sign in (1, -1)
+            m.twitch(stretch, seconds)
+            for stretch in (np.maximum(m.later(sign * m.dq, REFLEX_DELAY), 0) for sign in (1, -1))
             for seconds in MUSCLE
         ],
     ),
     "stiffness": Suspect(
         "a stiffness that depends on the angle",
         "move less far, or around one angle at a time",
-        lambda m: [(m.q - m.q.mean()) ** 2, (m.q - m.q.mean()) ** 3],
+        lambda m: [(q := m.q - m.q.mean()) ** 2, q**2 * q],
     ),
     "friction": Suspect(
         "dry friction",

@@ -80,7 +80,7 @@ class White:
 
     def apply(self, columns: AnyArray, valid: AnyArray, output: int = -1) -> NDArray[np.float64]:
         """Further columns (N, *k) through the same filter, of one output."""
-        before = whiten_rows(columns, valid, self.filtered)
+        before = whiten_rows(columns, valid, self.filtered) if self.filtered.order else columns
         return np.asarray(whiten_rows(before, valid, self.noise[output])) / self.size[output]
 
 
@@ -102,14 +102,15 @@ def whiten(pipeline: Pipeline, rows: Rows) -> White:
     filtered = Autoregression(every=every) if known is None else autoregression_of(known, every)
 
     def white(z: AnyArray, noise: Sequence[Autoregression]) -> NDArray[np.float64]:
-        return np.stack([whiten_rows(z[:, j], valid[:, j], noise[j]) for j in range(outputs)], axis=1)
+        found = [whiten_rows(z[:, j], valid[:, j], noise[j]) for j in range(outputs)]
+        return found[0][:, None] if outputs == 1 else np.stack(found, axis=1)
 
     p, noisy = W.shape[-1], [] if rows.noisy is None else [rows.noisy.reshape(W.shape)]
     z = white(np.concatenate([W, y[..., None], *noisy], axis=-1), [filtered] * outputs)
     noise = tuple(fit_window_noise(z[:, j, :p], z[:, j, p], valid[:, j], window, every) for j in range(outputs))
     z = white(z, noise)
     size = _sizes(z[..., :p], z[..., p], valid, window)
-    z = z / size[:, None]
+    z = z if outputs == 1 else z / size[:, None]
     W, y, shape = np.ascontiguousarray(z[..., :p]), np.ascontiguousarray(z[..., p]), rows.torque.shape
     flat = W.reshape(-1, p), y.ravel()
     windows = fit_disjoint(*flat, valid.ravel(), window * outputs)

@@ -12,6 +12,7 @@ judge by frequencies that it took away. So it looks back in steps of `every` row
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,8 +34,8 @@ LOST = 1e-10
 """A direction of a window's columns with a smaller share of their squares is left out: nothing is known of it."""
 LONGEST, NOTHING_MORE = 16, 0.001
 """Order of an autoregression of known noise, and the share of the error beyond it that is not worth more terms."""
-BLOCK, AT_ONCE = 32, 1 << 16
-"""Rows that are whitened by one row of a product, and numbers in one product, about."""
+BLOCK, AT_ONCE = 32, 1 << 14
+"""Rows that one row of a product whitens, and numbers that are worked on at once: so many stay at hand."""
 MOST_STEPS, LONGEST_STEP, NOTHING_LEFT = 7, 2.0, 1e-8
 """Newton's steps, how far each may go, and twice what the next one may gain of the logarithm of the likelihood when
 they end."""
@@ -174,13 +175,11 @@ def whiten_rows(
 
     The first rows after a gap are predicted from as many as there are, and weighted as exactly as they are known.
     """
-    valid, order = np.asarray(valid, bool), noise.order
-    z = np.where(valid.reshape(-1, *(1,) * (np.ndim(z) - 1)), np.asarray(z, float), 0)
-    if not order:
-        return z
+    z, valid, order = np.asarray(z, float), np.asarray(valid, bool), noise.order
     columns = z.reshape(len(z), -1)
-    white = _convolved(columns, noise.polynomial, noise.every)
-    white[~valid] = 0
+    if not order:
+        return np.where(valid[:, None], columns, 0).reshape(z.shape)
+    white = _convolved(columns, valid, noise.polynomial, noise.every)
     known = np.minimum(_rows_before(valid, noise.every), order)
     first = np.flatnonzero(valid & (known < order))
     table = np.zeros((order, order))
@@ -189,13 +188,17 @@ def whiten_rows(
         table[k, : k + 1] = np.sqrt(left[k]) * polynomial
     behind = noise.every * np.arange(order)
     for some in np.array_split(first, 1 + first.size * order * columns.shape[1] // AT_ONCE):
-        before = columns[np.maximum(some[:, None] - behind, 0)]
-        white[some] = (table[known[some], None] @ before)[:, 0]
+        before = np.maximum(some[:, None] - behind, 0)
+        counting = np.where(valid[before][:, :, None], columns[before], 0)
+        white[some] = (table[known[some], None] @ counting)[:, 0]
     return white.reshape(z.shape)
 
 
-def _convolved(columns: Numbers, polynomial: Numbers, every: int) -> Numbers:
-    """(N, k) sums of each row and those before it in steps of `every`, weighted: many rows by one matrix."""
+def _convolved(columns: Numbers, valid: NDArray[np.bool_], polynomial: Numbers, every: int) -> Numbers:
+    """(N, k) sums of each row and those before it in steps of `every`, weighted; zero where `valid` is False.
+
+    By a product of a matrix with many rows at once, as many as stay at hand.
+    """
     (n, k), order = columns.shape, len(polynomial) - 1
     size = max(order, BLOCK)
     reach, all_blocks = order * every, -(-n // (size * every))
@@ -205,18 +208,20 @@ def _convolved(columns: Numbers, polynomial: Numbers, every: int) -> Numbers:
         np.fill_diagonal(weights[order - behind :], weight)
     padded = np.zeros((k, every, order + blocks * size))
     around = sliding_window_view(padded, order + size, axis=2)[:, :, ::size]
-    found = np.empty((k, n))
+    rows, white, found = np.empty(around.shape), np.empty((k, every, blocks * size)), np.empty((k, n))
     for first in range(0, n, blocks * size * every):
-        piece = columns[max(0, first - reach) : first + blocks * size * every].T
+        piece = slice(max(0, first - reach), first + blocks * size * every)
+        counting = np.where(valid[piece], columns[piece].T, 0)
         before = reach - min(first, reach)
         for phase in range(every):
-            own = piece[:, phase::every]
+            own = counting[:, phase::every]
             padded[:, phase, before // every :][:, : own.shape[1]] = own
             padded[:, phase, before // every + own.shape[1] :] = 0
-        white = (around.reshape(-1, order + size) @ weights).reshape(k, every, -1)
+        np.copyto(rows, around)
+        np.matmul(rows.reshape(-1, order + size), weights, out=white.reshape(-1, size))
         for phase in range(every):
-            place = found[:, first + phase : first + blocks * size * every : every]
-            place[:] = white[:, phase, : place.shape[1]]
+            here = slice(first + phase, first + blocks * size * every, every)
+            found[:, here] = np.where(valid[here], white[:, phase, : len(valid[here])], 0)
     return found.T
 
 
@@ -264,53 +269,69 @@ def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, ever
             kept.append(runs)
     if not kept:
         return None
-    owner = np.repeat(np.arange(len(kept)), [len(runs) for runs in kept])
     alike: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
-    for k, run in zip(owner.tolist(), (run for runs in kept for run in runs), strict=True):
-        alike.setdefault(len(run), []).append((k, run))
+    for k, runs in enumerate(kept):
+        for run in runs:
+            alike.setdefault(len(run), []).append((k, run))
     groups = [(np.array([k for k, _ in members]), np.stack([run for _, run in members])) for members in alike.values()]
     gram = np.zeros((len(kept), q, q))
-    for of, index in groups:
+    for owner, index in groups:
         W = z[index, :q]
-        np.add.at(gram, of, W.swapaxes(1, 2) @ W)
-    basis, missing = np.zeros((len(kept), q + 1, q + 1)), np.zeros((len(kept), q))
+        np.add.at(gram, owner, W.swapaxes(1, 2) @ W)
+    basis = np.zeros((len(kept), q + 1, q + 1))
     basis[:, :q, :q], missing = _orthonormal(gram)
     basis[:, q, q] = 1
-    lagged, ends = np.zeros((order + 1, len(kept), q + 1, q + 1)), np.zeros((order, 2, len(owner), q + 1))
-    done = 0
-    for of, index in groups:
-        for some in np.array_split(np.arange(len(of)), 1 + index.size * (q + 1) ** 2 // AT_ONCE):
-            rows = z[index[some]] @ basis[of[some]]
-            np.add.at(lagged, (slice(None), of[some]), _lagged_products(rows, order))
-            ends[:, :, done : done + len(some)] = np.stack([rows[:, :order], rows[:, : -order - 1 : -1]]).transpose(
-                2, 0, 1, 3
-            )
-            done += len(some)
-    by_owner = np.argsort(np.tile(np.concatenate([of for of, _ in groups]), 2), kind="stable")
-    rows_of = np.array([sum(map(len, runs)) for runs in kept]) / every
-    return _Sums(
-        lagged=lagged,
-        ends=ends.reshape(order, -1, q + 1)[:, by_owner],
-        owner=np.repeat(owner, 2),
-        missing=missing,
-        runs=np.array([len(runs) for runs in kept], float) / every,
-        freedom=rows_of - q + missing.sum(axis=1),
+    lagged, ends, owner = _of_runs(z, groups, basis, order)
+    freedom = np.array([sum(map(len, runs)) for runs in kept]) / every - q + missing.sum(axis=1)
+    return _Sums(lagged, ends, owner, missing, np.array([len(runs) for runs in kept], float) / every, freedom)
+
+
+def _of_runs(
+    z: Numbers, groups: list[tuple[NDArray[np.int64], NDArray[np.int64]]], basis: Numbers, order: int
+) -> tuple[Numbers, Numbers, NDArray[np.int64]]:
+    """The first three fields of `_Sums`, of groups of runs of one length: their windows (R,) and rows (R, n)."""
+    columns, ends, owners = z.shape[1], [], []
+    lagged = np.zeros((len(basis), order + 1, columns, columns))
+    for owner, index in groups:
+        for some in np.array_split(np.arange(len(owner)), 1 + index.size * columns**2 // AT_ONCE):
+            rows = z[index[some]] @ basis[owner[some]]
+            np.add.at(lagged, owner[some], _lagged_products(rows, order))
+            ends += [rows[:, :order], rows[:, : -order - 1 : -1]]
+            owners += [owner[some]] * 2
+    owner = np.concatenate(owners)
+    sorting = np.argsort(owner, kind="stable")
+    return (
+        np.ascontiguousarray(lagged.swapaxes(0, 1)),
+        np.ascontiguousarray(np.concatenate(ends)[sorting].swapaxes(0, 1)),
+        owner[sorting],
     )
 
 
 def _lagged_products(z: Numbers, order: int) -> Numbers:
-    """(P + 1, K, q, q) sums over t of z[t] z[t + lag]' and its transpose, of K runs of n rows; at lag zero once."""
+    """(R, P + 1, q, q) sums over t of z[t] z[t + lag]' and its transpose, of R runs of n rows; at lag zero once.
+
+    From the cross spectra of rows with as many zeros behind them as there are lags.
+    """
+    q, (frequencies, cosines) = z.shape[2], _cosines(z.shape[1] + order, order)
+    spectrum = np.fft.rfft(z, frequencies, axis=1).transpose(2, 0, 1)
+    one, other = np.triu_indices(q)
+    real, imaginary = spectrum.real.copy(), spectrum.imag.copy()
+    products = (real[one] * real[other] + imaginary[one] * imaginary[other]) @ cosines
+    found = np.empty((len(z), order + 1, q, q))
+    found[..., one, other] = found[..., other, one] = products.transpose(1, 2, 0)
+    return found
+
+
+@lru_cache(maxsize=16)
+def _cosines(least: int, order: int) -> tuple[int, Numbers]:
+    """A length of Fourier transforms, at least so much, and (F, P + 1) what makes sums by lag of a real spectrum."""
     from scipy.fft import next_fast_len
 
-    q, size = z.shape[2], next_fast_len(z.shape[1] + order, real=True)
-    spectrum = np.fft.rfft(z, size, axis=1).transpose(2, 0, 1)
-    one, other = np.triu_indices(q)
-    power = spectrum.real[one] * spectrum.real[other] + spectrum.imag[one] * spectrum.imag[other]
-    products = np.fft.irfft(power, size)[..., : order + 1]
-    products[..., 1:] *= 2
-    found = np.empty((order + 1, len(z), q, q))
-    found[..., one, other] = found[..., other, one] = products.transpose(2, 1, 0)
-    return found
+    size = next_fast_len(least, real=True)
+    frequency, lag = np.arange(size // 2 + 1)[:, None], np.arange(order + 1)
+    # Most frequencies stand for their negative too, and most lags.
+    both = np.where(2 * frequency % size == 0, 1, 2) * np.where(lag == 0, 1, 2)
+    return size, both * np.cos(2 * np.pi * (frequency * lag % size) / size) / size
 
 
 def _orthonormal(gram: Numbers) -> tuple[Numbers, Numbers]:
@@ -405,7 +426,7 @@ def _likelihood(reflections: Numbers, sums: _Sums, curved: bool = False) -> tupl
 def _of_windows(
     a: Numbers, lagged: Numbers, residual: Numbers, inverse: Numbers, share: Numbers, rss: Numbers
 ) -> Numbers:
-    """(k + 1, k + 1) by how much second derivatives are smaller since every window has a size and parameters of its own."""
+    """(k + 1, k + 1) by how much second derivatives are smaller since windows have sizes and parameters of their own."""
     order, q = len(a) - 1, inverse.shape[1]
     lag, padded = np.arange(order + 1), np.concatenate([np.zeros(order), a, np.zeros(order)])
     around = padded[lag[:, None] - lag + order] + padded[lag[:, None] + lag + order]

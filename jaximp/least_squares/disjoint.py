@@ -33,15 +33,10 @@ class DisjointFit(NamedTuple):
         """(K,) residual sum of squares."""
         return (self.residual**2).sum(axis=1)
 
-    @property
-    def span(self) -> int:
-        """Rows of all windows."""
-        return self.residual.size
-
     def orthonormal(self, W: Numbers, some: slice = slice(None)) -> Numbers:
         """(M, S, p) orthonormal columns of some windows of W (N, p), zero in rows that do not count."""
         windows, size = self.residual.shape
-        return W[: self.span].reshape(windows, size, -1)[some] @ self.inverse[some]
+        return W[: self.residual.size].reshape(windows, size, -1)[some] @ self.inverse[some]
 
 
 def fit_disjoint(

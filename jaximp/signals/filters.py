@@ -87,9 +87,7 @@ def filter_zero_phase_padded(
     return reversed_from_end(y)[:-edge]
 
 
-def filter_zero_phase_decimated(
-    sos: tuple[tuple[float, ...], ...], x: Num[AnyArray, "k N"], every: int
-) -> Float[AnyArray, "k M"]:
+def filter_zero_phase_decimated(sos: Sections, x: Num[AnyArray, "k N"], every: int) -> Float[AnyArray, "k M"]:
     """Every so many samples of `filter_zero_phase` of signals with time on axis 1, by numpy.
 
     What stands between them is worked out nowhere: a block of samples makes, by one matrix, what is kept of it and
@@ -97,10 +95,12 @@ def filter_zero_phase_decimated(
 
     **Raises:** `ValueError` if there are too few samples for the extension.
     """
-    from scipy.signal import sosfilt, sosfilt_zi
+    from scipy.signal import sosfilt
 
     sections = np.asarray(sos, np.float64)
-    edge, rest = _edge_within(sections, x.shape[1]), sosfilt_zi(sections)
+    sos = tuple(map(tuple, sections.tolist()))
+    rest = padded_filter(sos).rest
+    edge = _edge_within(sections, x.shape[1])
     start, end = 2 * x[:, :1] - x[:, edge:0:-1], 2 * x[:, -1:] - x[:, -2 : -edge - 2 : -1]
     by = _decimation(sos, every)
     blocks = x.shape[1] // by.size

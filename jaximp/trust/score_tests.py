@@ -80,16 +80,16 @@ def score_groups(
 
     **Arguments:** `W` (N, p) and `y` (N,) rows whose noise is white; `groups` of further columns (N, g) that went
     through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one;
-    `fit` of W and y in these windows, where it is known.
+    `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns.
 
     **Source:** score test with a covariance that knows nothing of the noise's size row by row (White 1980; residuals
     scaled by their leverage).
     """
-    if not valid.all():
+    if fit is None:
         W, y = np.where(valid[:, None], W, 0), np.where(valid, y, 0)
         groups = {name: np.where(valid[:, None], columns, 0) for name, columns in groups.items()}
-    fit = fit_disjoint(W, y, valid, window) if fit is None else fit
-    sums = _sums(W, np.concatenate([columns.T for columns in groups.values()]), fit, every)
+        fit = fit_disjoint(W, y, valid, window)
+    sums = _sums(W, list(groups.values()), fit, every)
     found, first = [], 0
     for name, columns in groups.items():
         own = slice(first, first := first + columns.shape[1])
@@ -108,16 +108,15 @@ def _with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
     return sound[(fit.excitation[sound] > STILL * usual).all(axis=1)]
 
 
-def _sums(W: Numbers, columns: Numbers, fit: DisjointFit, every: int) -> _Sums:
-    """Of columns (G, N)."""
-    (count, p), window, g = fit.excitation.shape, fit.residual.shape[1], len(columns)
-    by_window = columns[:, : fit.span].reshape(g, count, window).swapaxes(0, 1)
+def _sums(W: Numbers, groups: Sequence[Numbers], fit: DisjointFit, every: int) -> _Sums:
+    p, window, g = W.shape[1], fit.residual.shape[1], sum(columns.shape[1] for columns in groups)
     chosen = _with_say(fit, every)
     freedom = fit.rows[chosen] / every - p
     scale = fit.rss[chosen] / (freedom * every)
     gram, spread, score, passed, size = np.zeros((g, g)), np.zeros((g, g)), np.zeros(g), np.zeros((p, g)), np.zeros(g)
     for k, variance in zip(chosen.tolist(), scale.tolist(), strict=True):
-        Q, z, residual = fit.orthonormal(W, slice(k, k + 1))[0], by_window[k], fit.residual[k]
+        Q, residual = fit.orthonormal(W, slice(k, k + 1))[0], fit.residual[k]
+        z = np.concatenate([columns[k * window : (k + 1) * window].T for columns in groups])
         within = z @ Q
         rest = z - within @ Q.T
         gram += rest @ rest.T / variance
@@ -131,7 +130,7 @@ def _sums(W: Numbers, columns: Numbers, fit: DisjointFit, every: int) -> _Sums:
 
 
 def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
-    from scipy.stats import f
+    from scipy.special import fdtrc
 
     size = np.where(sums.size[own] > 0, sums.size[own], 1)
     gram, spread = (x[own, own] / size / size[:, None] for x in (sums.gram, sums.spread))
@@ -147,7 +146,7 @@ def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
     covariance, weights = inverse @ spread @ inverse, inverse @ score
     return Misfit(
         group=name,
-        p=float(f.sf(statistic / k, k, freedom - k)),
+        p=float(fdtrc(k, freedom - k, statistic / k)),
         statistic=statistic,
         evidence=statistic - k * np.log(freedom),
         weights=kept @ weights / size,
