@@ -426,7 +426,7 @@ def _likelihood(reflections: Numbers, sums: _Sums, curved: bool = False) -> tupl
 def _of_windows(
     a: Numbers, lagged: Numbers, residual: Numbers, inverse: Numbers, share: Numbers, rss: Numbers
 ) -> Numbers:
-    """(k + 1, k + 1) by how much second derivatives are smaller since windows have sizes and parameters of their own."""
+    """(k + 1, k + 1) what second derivatives lose since windows have sizes and parameters of their own."""
     order, q = len(a) - 1, inverse.shape[1]
     lag, padded = np.arange(order + 1), np.concatenate([np.zeros(order), a, np.zeros(order)])
     around = padded[lag[:, None] - lag + order] + padded[lag[:, None] + lag + order]

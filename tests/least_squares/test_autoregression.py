@@ -8,10 +8,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
 
+from jaximp.least_squares import autoregression
 from jaximp.least_squares.autoregression import (
     NEARLY_ONE,
     Autoregression,
+    _fit,
     _likelihood,
+    _searched,
+    _straight,
     _stretches,
     _sums,
     autoregression_of,
@@ -159,6 +163,29 @@ def test_a_long_step_of_the_search_ends_nothing() -> None:
         for signs in random.choice([-1, 1], size=(40, order)):
             value, slopes, _ = _likelihood(NEARLY_ONE * signs, sums)
             assert np.isfinite([value, *slopes]).all()
+
+
+def test_newtons_steps_lead_where_the_search_along_lines_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autoregression, "SETTLED", 1e-8)
+    W, _ = rows(4000, seed=14)
+    y = W @ [3.0, -2.0, 5.0] + sample(NOISE, 4000, np.random.default_rng(15))
+    sums = _sums(np.column_stack([W, y]), _stretches(gaps(50, 70), 200, 1), 8, 1)
+    assert sums is not None
+    for order in (2, 4, 8):
+        near = np.arctanh(np.pad(NOISE.reflections, (0, 5))[:order])
+        found, other = _straight(sums, near), _searched(sums, np.zeros(order))
+        assert found is not None
+        np.testing.assert_allclose(found[0], other[0], atol=1e-6)
+        assert found[1] == pytest.approx(other[1], abs=1e-6)
+
+
+def test_where_newtons_steps_go_astray_the_search_along_lines_takes_over() -> None:
+    W, _ = rows(4000, seed=16)
+    y = sample(Autoregression(np.array([-0.99, 0.9])), 4000, np.random.default_rng(17))
+    sums = _sums(np.column_stack([W, y]), _stretches(np.ones(4000, bool), 200, 1), 2, 1)
+    assert sums is not None
+    assert _straight(sums, np.zeros(2)) is None
+    np.testing.assert_allclose(_fit(sums, np.zeros(2))[0], [-0.99, 0.9], atol=0.03)
 
 
 def gaps(*lengths: int) -> NDArray[np.bool_]:

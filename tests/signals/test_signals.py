@@ -26,6 +26,7 @@ from jaximp.signals import (
     fill_gaps,
     filter_in_windows,
     filter_zero_phase,
+    filter_zero_phase_decimated,
     noise_level,
     quantisation_step,
     reach,
@@ -72,6 +73,15 @@ def test_filter_is_scipys(order: int, cutoff: float, kind: str, shape: tuple[int
     x = 3 + noise(shape, seed).cumsum(axis=0)
     expected = sosfiltfilt(sos, x, axis=0)
     assert np.abs(filter_zero_phase(sos, x) - expected).max() <= 1e-9 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("sos", FILTERS)
+@pytest.mark.parametrize(("samples", "every"), [(1000, 10), (961, 7), (60, 10), (500, 1), (320, 160)])
+def test_what_is_kept_of_every_so_many_samples_is_scipys(sos: NDArray[np.float64], samples: int, every: int) -> None:
+    x = 3 + noise((3, samples)).cumsum(axis=1)
+    expected = sosfiltfilt(sos, x)[:, ::every]
+    found = filter_zero_phase_decimated(sos, x, every)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(x).max())
 
 
 @pytest.mark.parametrize("sos", FILTERS[1::2])
