@@ -8,6 +8,8 @@ standard errors (those of white noise), condition number and variance accounted 
 RollingOLS, theta alone. The batch's time is that of a whole run, compilation and overview among it. All is measured in
 one run of this script. Writes results/batch.json and .md.
 
+The batch estimates the noise and tests the model, as it does by default; beside it runs one with the filters' noise.
+
     python experiments/benchmarks/batch.py [recordings, 10000 by default]
 """
 
@@ -60,6 +62,7 @@ position_cutoff = 40
 [window]
 length = 2
 step = 0.01
+noise = "{noise}"
 """
 JOBS = {"decimated": "decimation_cutoff = 20", "every_sample": ""}
 
@@ -81,7 +84,8 @@ def simulate(folder: Path, count: int, lengths: bool = False) -> None:
     for k in range(DISTINCT, 0 if lengths else count):
         os.link(folder / f"r{k % DISTINCT:05d}.parquet", folder / f"r{k:05d}.parquet")
     for name, text in JOBS.items():
-        (folder / f"{name}.toml").write_text(JOB.format(filter=text))
+        (folder / f"{name}.toml").write_text(JOB.format(filter=text, noise="estimated"))
+        (folder / f"{name}_filtered.toml").write_text(JOB.format(filter=text, noise="filtered"))
 
 
 def rows_by_scipy(path: Path, low_pass: bool) -> tuple[np.ndarray, np.ndarray, int]:
@@ -167,7 +171,7 @@ def phases(folder: Path, job: Job, out: Path) -> dict[str, float]:
     """Where the time of a batch goes [ms per recording], on one thread."""
     plan = make_plan(job, find_items([str(folder / "r*.parquet")]))
     task, spent = batch_results.Task.of(job, plan, out), {"read": 0.0, "solve": 0.0, "measure": 0.0}
-    originals = {"read": batch_results._read, "solve": batch_results.solve_stack, "measure": batch_results.measure}
+    originals = {"read": batch_results._read, "solve": batch_results._prepared, "measure": batch_results.measure}
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any) -> Any:
@@ -179,11 +183,11 @@ def phases(folder: Path, job: Job, out: Path) -> dict[str, float]:
         return call
 
     batch_results._read = timed("read", originals["read"])
-    batch_results.solve_stack = timed("solve", originals["solve"])
+    batch_results._prepared = timed("solve", originals["solve"])
     batch_results.measure = timed("measure", originals["measure"])
     chosen = [one for one in plan.batches if len(one.items) == one.stacked][:4]
     total = seconds(lambda: [batch_results.solve_batch(task, one) for one in chosen])
-    batch_results._read, batch_results.solve_stack = originals["read"], originals["solve"]
+    batch_results._read, batch_results._prepared = originals["read"], originals["solve"]
     batch_results.measure = originals["measure"]
     count = sum(len(one.items) for one in chosen)
     spent["read"], spent["solve"] = spent["read"] - spent["measure"], spent["solve"] + spent["measure"]
@@ -217,6 +221,10 @@ def main(count: int) -> None:
             times = one_run(folder, job, top / which)
             found["batch_processor_ms"] = 1e3 * (time.process_time() - begin) / count
             found |= {"batch_ms": 1e3 * times[-1][0] / count, "batch_once_compiled_ms": 1e3 / rate(times)}
+            begin = time.process_time()
+            one_run(folder, read_job(folder / f"{which}_filtered.toml"), top / f"{which}_filtered")
+            found["filtered_processor_ms"] = 1e3 * (time.process_time() - begin) / count
+            found["estimated_over_filtered"] = found["batch_processor_ms"] / found["filtered_processor_ms"]
             times = one_run(folder, job, top / which, workers=2)
             found["two_workers_ms"] = 1e3 * times[-1][0] / count
             one_worker = one_run(folder, job, top / which, workers=1)
@@ -256,6 +264,8 @@ def write(results: dict[str, Any]) -> None:
         ("loop, with statistics, of all processors [ms]", "loop_statistics_processor_ms"),
         ("RollingOLS, of all processors [ms]", "rolling_ols_processor_ms"),
         ("batch in process, of all processors [ms]", "batch_processor_ms"),
+        ("the same with the filters' noise and no tests, of all processors [ms]", "filtered_processor_ms"),
+        ("estimated noise and tests, over that", "estimated_over_filtered"),
         ("two workers over one, once compiled", "two_workers_over_one"),
         ("times faster than the faster of theta alone", "times_faster_than_theta_alone"),
         ("times faster than the loop with statistics", "times_faster_than_with_statistics"),
