@@ -15,6 +15,7 @@ from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interv
 from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.results import Column, Result
+from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit
 from jaximp.trust.verdicts import Verdicts, worst
@@ -109,6 +110,8 @@ class Estimates(Result):
     """Of each joint (or, for an arm, in one array) frequency [Hz] and density of the noise that was estimated."""
     bands: Bands | None = None
     """Ordinary least squares beside the estimates, where these are others."""
+    frequencies: tuple[ByFrequency, ...] = ()
+    """Of each joint the estimates by bands of frequencies, where curves were wanted and there is enough to compare."""
     lacking: Mapping[str, str] = field(default_factory=dict)
     """Parameters that what the model lacks moves beyond error and a share that matters, and why, in words."""
     reflexes: tuple[Reflex, ...] = ()

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import (
@@ -50,7 +51,7 @@ from jaximp.models.reflex import pathway_of, with_gain
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands
-from jaximp.trust.window_rules import judge_together, judged_names, measure_windows
+from jaximp.trust.window_rules import excited_windows, judge_together, judged_names, measure_windows
 from jaximp.types import Progress, Recording, nearest
 
 CLEAR = 2.0
@@ -381,6 +382,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         units=model.units,
         fit=fit,
         noise=tuple(one for part in parts for one in part.noise),
+        frequencies=tuple(one.of_joint(j) for j, part in enumerate(parts) for one in part.frequencies),
         misfits=tuple(
             replace(one, group=f"joint {j + 1}: {one.group}") for j, part in enumerate(parts) for one in part.misfits
         ),
@@ -422,7 +424,7 @@ def at_other_lengths(
         with suppress(ValueError):
             other.check(prepared.recording)
             shared = with_windows(prepared, other) if other.once else prepare(other, prepared.recording, alone)
-            return in_windows(shared, longest=max(factors) * length)
+            return in_windows(shared, longest=max(factors) * length, curves=False)
         return []
 
     found = []
@@ -514,6 +516,7 @@ def _estimates(
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
     measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy)
     measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
+    side_by_side = _apart(place) * np.flatnonzero(excited_windows(measured, limits)[:: _apart(place)])
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown].reshape(reconstructed.shape)
     about = (jump_note(prepared.recording, prepared.jumps), _literal_note(pipeline), why_not, *of_model.notes, *notes)
@@ -533,10 +536,11 @@ def _estimates(
         torque=torque,
         reconstructed=reconstructed,
         predicted=predicted,
-        notes=(*prepared.recording.notes, *filter(None, about)),
+        notes=(*prepared.recording.notes, *filter(None, about), *changes(model, fit, side_by_side)),
         reflexes=reflexes,
         misfits=misfits,
         bands=of_model.bands,
+        frequencies=by_frequency(pipeline, rows, prepared.white) if misfits and curves else (),
         noise=_noise_spectra(prepared, torque - reconstructed) if curves else (),
         lacking={name: text for name, text in of_model.lacking.items() if name not in weights},
     )

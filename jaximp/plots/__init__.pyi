@@ -1,5 +1,6 @@
 from . import interactive as interactive
 from .arm import ellipses as ellipses
+from .estimates import by_frequency as by_frequency
 from .estimates import condition_over_time as condition_over_time
 from .estimates import effort as effort
 from .estimates import methods as methods

@@ -38,6 +38,7 @@ from jaximp.plots.style import (
     styled,
 )
 from jaximp.plots.wording import main_parameter, number, pretty_unit, with_unit
+from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
 from jaximp.types import AnyArray
 
@@ -142,6 +143,33 @@ def residual_spectrum(estimates: Estimates) -> Figure:
         panel.set(xlabel="frequency (Hz)", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
         _spectra(panel, estimates, joint)
     _legend(figure, max(panels, key=lambda panel: len(panel.get_lines())), [])
+    return figure
+
+
+@styled
+def by_frequency(estimates: Estimates, level: float = 0.95) -> Figure:
+    """Every parameter by bands of frequencies with its confidence interval of the given level, beside its means over
+    windows by ordinary and by generalised least squares; one row per joint.
+
+    **Raises:** `ValueError` for estimates without `frequencies`.
+    """
+    joints = estimates.frequencies
+    if not joints:
+        raise ValueError("these estimates were not split by frequency: that needs white rows and several windows")
+    most = max(len(found.names) for found in joints)
+    columns = min(most, 3)
+    rows = -(-most // columns)
+    figure = Figure(figsize=(WIDTH, 2.1 * rows * len(joints) + 0.5))
+    panels = figure.subplots(rows * len(joints), columns, squeeze=False).reshape(len(joints), -1)
+    for of_joint, found in zip(panels, joints, strict=True):
+        for k, panel in enumerate(of_joint):
+            if k < len(found.names):
+                _band_panel(panel, found, k, level)
+            else:
+                panel.set_visible(False)
+    for panel in figure.axes[-columns:]:
+        panel.set_xlabel("frequency (Hz)")
+    _legend(figure, max(figure.axes, key=lambda panel: len(panel.get_legend_handles_labels()[0])), [])
     return figure
 
 
@@ -407,6 +435,31 @@ def _excerpt(estimates: Estimates, joint: int) -> slice:
     best = full[found == found.max()]
     first = int(best[np.abs(time[best] + EXCERPT / 2 - (time[0] + time[-1]) / 2).argmin()])
     return slice(first, int(stop[first]))
+
+
+def _band_panel(panel: Axes, found: ByFrequency, k: int, level: float) -> None:
+    """Parameter k by bands; those that do not determine it are hatched."""
+    edges, value = found.edges, found.value[:, k]
+    low, high = (end[:, k] for end in found.interval(level))
+    lines = ((found.generalised[k], BLUE, "-", "generalised"), (found.ordinary[k], VERMILLION, "--", "ordinary"))
+    for mean, color, style, label in lines:
+        panel.axhline(mean, color=color, linestyle=style, linewidth=1, label=f"{label} least squares")
+    known = np.isfinite(value)
+    if known.any():
+        across = np.abs(np.stack([edges[:-1], edges[1:]]) - found.middle)[:, known]
+        up = np.stack([value - low, high - value])[:, known]
+        label = f"in a band, {level:.0%} interval"
+        panel.errorbar(found.middle[known], value[known], up, across, color=BLACK, fmt="o", capsize=2, label=label)
+    for left, right in zip(edges[:-1][~known], edges[1:][~known], strict=True):
+        grey, hatch = SHADES[WEAK]
+        label = "not determined" if left == edges[:-1][~known][0] else ""
+        panel.axvspan(left, right, facecolor=grey, edgecolor=HATCH, hatch=hatch, linewidth=0, zorder=0, label=label)
+    panel.set_title(with_unit(found.names[k], found.units[k]), loc="left")
+    panel.set_xscale("log")
+    panel.set_xlim(edges[0] / 1.1, edges[-1] * 1.1)
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    panel.minorticks_off()
 
 
 def _longest_stretch(estimates: Estimates, joint: int) -> tuple[list[Numbers], float]:

@@ -32,6 +32,7 @@ from jaximp.reports.pages import (
     Prose,
     Section,
     Table,
+    capitalised,
     closing_sections,
     digits,
     figure_sections,
@@ -41,6 +42,8 @@ from jaximp.reports.pages import (
     write_page,
     write_table,
 )
+from jaximp.trust.frequencies import ByFrequency
+from jaximp.trust.score_tests import p_in_words
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
 from jaximp.types import Recording, listed
 
@@ -75,6 +78,10 @@ CAPTIONS = {
     "parameters apart. Where the held-out VAF falls below the other, the parameters change or fit noise.",
     "residual_spectrum": "What the model leaves over, by frequency. A peak that the torque has as well is something "
     "that the model lacks. The estimated noise is what tells how far each frequency can be relied on.",
+    "by_frequency": "Each parameter by bands of frequencies that excite the model equally. Ordinary least squares of "
+    "filtered rows counts bands with much torque more, generalised least squares those with little noise: where the "
+    "parameter is the same at all frequencies both agree with every band. Hatched bands do not determine it. A "
+    "parameter that changes from window to window makes no interval longer.",
     "reflex": "What a stretch does to the torque as time goes by: the weight of every lag of the rectified velocity. "
     "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
     "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "
@@ -89,6 +96,7 @@ TITLES = {
     "torque": "Torque",
     "condition": "Condition of the windows",
     "residual_spectrum": "Spectrum of the residual",
+    "by_frequency": "Estimates by frequency",
     "reflex": "Reflex",
     "window_lengths": "Window lengths",
     "methods": "Methods",
@@ -157,6 +165,8 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
         "condition": plots.condition_over_time(main),
         "residual_spectrum": plots.residual_spectrum(main),
     }
+    if main.frequencies:
+        figures["by_frequency"] = plots.by_frequency(main)
     if main.reflexes:
         figures["reflex"] = plots.reflex_weights(main)
     if lengths:
@@ -170,7 +180,8 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
     """The report on a `summary`."""
     images, recording, windows = pictures(estimates_list, lengths), content["recording"], content["windows"]
     main = main_parameter(estimates_list[0].names)
-    below = {
+    below: dict[str, list[Part]] = {
+        "by_frequency": [Prose(said) for said in map(frequencies_in_words, estimates_list[0].frequencies)],
         "methods": [_comparison("Method", main, {str(one["method"]): one for one in _all_methods(content)})],
         "window_lengths": [
             _comparison("Window", main, {f"{number(one['window_s'])} s": one for one in content["window_lengths"]})
@@ -334,6 +345,38 @@ def _tests(content: dict[str, Any]) -> list[Section]:
         "probability that so much would be found where nothing is missing; of all rows together 1 % is allowed."
     )
     return [Section("Tests of the model", [Prose(said), Table(columns, rows, remark=told)])]
+
+
+def frequencies_in_words(found: ByFrequency) -> str:
+    """Which parameters of a joint depend on the frequency, and where they are not determined."""
+    depend, same, open_ones, left_out = [], [], [], []
+    for k, (name, unit) in enumerate(zip(found.names, found.units, strict=True)):
+        known = np.flatnonzero(np.isfinite(found.value[:, k]))
+        if len(known) < len(found.middle):
+            left_out.append(f"{words(name)} at {listed(_ranges(found.edges, known))} Hz")
+        if not np.isfinite(found.p[k]):
+            open_ones.append(words(name))
+        elif found.depends(k):
+            farthest = sorted(known[[found.value[known, k].argmin(), found.value[known, k].argmax()]])
+            values = (f"{digits(found.value[b, k], 3)} around {digits(found.middle[b], 2)} Hz" for b in farthest)
+            depend.append(f"{words(name)} ({' and '.join(values)}, in {pretty_unit(unit)}; {p_in_words(found.p[k])})")
+        else:
+            same.append(words(name))
+    said = [
+        f"{listed(depend)} {'depends' if len(depend) == 1 else 'depend'} on the frequency." if depend else "",
+        f"No dependence on the frequency beyond error and 5 % was found of {listed(same)}." if same else "",
+        f"Whether {listed(open_ones)} does cannot be told: fewer than two bands determine it." if open_ones else "",
+        f"Left out, since the band does not determine it: {listed(left_out)}." if left_out else "",
+    ]
+    text = " ".join(filter(None, said))
+    return capitalised(text)
+
+
+def _ranges(edges: NDArray[np.float64], known: NDArray[np.int64]) -> list[str]:
+    """The bands that are not known, neighbours together."""
+    others = np.setdiff1d(np.arange(len(edges) - 1), known)
+    runs = np.split(others, np.flatnonzero(np.diff(others) > 1) + 1)
+    return [f"{digits(edges[run[0]], 2)} to {digits(edges[run[-1] + 1], 2)}" for run in runs]
 
 
 def _all_methods(content: dict[str, Any]) -> list[dict[str, Any]]:

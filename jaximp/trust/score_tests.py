@@ -97,7 +97,7 @@ def score_groups(
     return [one for one in found if one is not None]
 
 
-def _with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
+def with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
     """Windows that are determined, and move enough against the others that their parameters are not free to go
     anywhere."""
     p = fit.inverse.shape[1]
@@ -110,7 +110,7 @@ def _with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
 
 def _sums(W: Numbers, groups: Sequence[Numbers], fit: DisjointFit, every: int) -> _Sums:
     p, window, g = W.shape[1], fit.residual.shape[1], sum(columns.shape[1] for columns in groups)
-    chosen = _with_say(fit, every)
+    chosen = with_say(fit, every)
     freedom = fit.rows[chosen] / every - p
     scale = fit.rss[chosen] / (freedom * every)
     gram, spread, score, passed, size = np.zeros((g, g)), np.zeros((g, g)), np.zeros(g), np.zeros((p, g)), np.zeros(g)
@@ -205,3 +205,8 @@ def significant(tests: Sequence[Misfit], level: float = FAMILYWISE) -> list[Misf
             break
         found.append(one)
     return sorted(found, key=lambda one: -one.evidence)
+
+
+def p_in_words(p: float) -> str:
+    """A probability as papers print it."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"

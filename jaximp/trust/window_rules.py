@@ -194,6 +194,11 @@ def judge_together(
     return replace(windows, worse_than_nothing=worse, mass_below_zero=below)
 
 
+def excited_windows(windows: Windows, limits: TrustLimits = USUAL) -> NDArray[np.bool_]:
+    """(M,) whose motion determines the parameters; the torque may still contradict the model."""
+    return judge_all(EXCITATION, windows, limits).trusted
+
+
 def judged_names(model: Model, limits: TrustLimits = USUAL) -> list[str]:
     """The parameters that the verdict looks at."""
     judged = _judged(model.names, model.roles, limits.parameters)

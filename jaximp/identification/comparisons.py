@@ -1,0 +1,58 @@
+"""Whether each parameter of a joint is the same at all frequencies, for a figure, and in all windows, for a note."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.regression import Rows
+from jaximp.identification.whitening import White
+from jaximp.least_squares.window import SlidingFit
+from jaximp.models.base import Model
+from jaximp.models.reflex import pathway_of
+from jaximp.trust.changes import find_changes
+from jaximp.trust.frequencies import ByFrequency, estimate_by_frequency
+from jaximp.trust.score_tests import p_in_words
+
+
+def compared(model: Model) -> list[int]:
+    """Columns of the parameters that are compared: not a constant torque, nor the weights of a reflex one by one."""
+    weights = set(pathway_of(model).columns) if model.memory else set()
+    return [
+        k
+        for k, (column, role) in enumerate(zip(model.columns, model.roles, strict=True))
+        if role.kind != "offset" and column not in weights
+    ]
+
+
+def by_frequency(pipeline: Pipeline, rows: Rows, white: White) -> tuple[ByFrequency, ...]:
+    """What differs between frequencies, of one joint; parameters that are not compared keep what each window finds.
+    Empty where there is too little to compare."""
+    model, limits = pipeline.model, pipeline.limits
+    of_white, as_filtered = ((np.asarray(x.W), np.asarray(x.torque)) for x in (white, rows))
+    rate = pipeline.sample_rate / pipeline.filters.decimate
+    parameters = {k: (model.names[k], model.units[k]) for k in compared(model)}
+    found = estimate_by_frequency(
+        of_white,
+        as_filtered,
+        np.asarray(rows.valid),
+        pipeline.window_rows,
+        white.every,
+        rate,
+        parameters,
+        limits.max_relative_stderr,
+    )
+    return () if found is None else (found,)
+
+
+def changes(model: Model, fit: SlidingFit, which: NDArray[np.int64]) -> list[str]:
+    """Which parameters are not the same in windows that share no rows, in words; `which` these are."""
+    columns = compared(model)
+    value, stderr, dof = (np.asarray(x)[which] for x in (fit.theta, fit.stderr, fit.dof))
+    found = find_changes(value[:, columns], stderr[:, columns], dof)
+    return [
+        f"{model.names[columns[k]]} is not the same in all windows: from {one.low:.3g} to {one.high:.3g} "
+        f"{model.units[columns[k]]}, {p_in_words(one.p)}"
+        for k, one in found.items()
+    ]
