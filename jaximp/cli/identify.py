@@ -77,6 +77,9 @@ def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
 def _say_result(estimates: Estimates) -> None:
     counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
     typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    unpredictive = int(estimates.unpredictive.sum())
+    if unpredictive:
+        typer.echo(f"of the trusted, {unpredictive} predict the torque of the next window worse than a constant would")
     complaint, shown = estimates.verdicts.complaint(), estimates.summarised()
     if complaint:
         typer.echo(complaint)

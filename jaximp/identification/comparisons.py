@@ -46,13 +46,14 @@ def by_frequency(pipeline: Pipeline, rows: Rows, white: White) -> tuple[ByFreque
     return () if found is None else (found,)
 
 
-def changes(model: Model, fit: SlidingFit, which: NDArray[np.int64]) -> list[str]:
+def changes(pipeline: Pipeline, fit: SlidingFit, which: NDArray[np.int64]) -> list[str]:
     """Which parameters are not the same in windows that share no rows, in words; `which` these are."""
-    columns = compared(model)
+    model, columns = pipeline.model, compared(pipeline.model)
+    doubt = "" if pipeline.whitens else "; or its errors are too small, since the noise was taken as white"
     value, stderr, dof = (np.asarray(x)[which] for x in (fit.theta, fit.stderr, fit.dof))
     found = find_changes(value[:, columns], stderr[:, columns], dof)
     return [
         f"{model.names[columns[k]]} is not the same in all windows: from {one.low:.3g} to {one.high:.3g} "
-        f"{model.units[columns[k]]}, {p_in_words(one.p)}"
+        f"{model.units[columns[k]]}, {p_in_words(one.p)}{doubt}"
         for k, one in found.items()
     ]

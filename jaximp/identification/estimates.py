@@ -146,6 +146,11 @@ class Estimates(Result):
         """(M,) which windows break no rule."""
         return self.verdicts.trusted
 
+    @property
+    def unpredictive(self) -> NDArray[np.bool_]:
+        """(M,) trusted windows whose parameters predict the torque of the next one worse than a constant would."""
+        return np.asarray(self.trusted & (self.held_out_vaf < 0))
+
     def trusted_in(self, name: str) -> NDArray[np.bool_]:
         """(M,) which windows can be trusted in one parameter: what the model lacks may spare it."""
         spared = name not in self.lacking and self.verdicts.rule == NOTHING_MISSING

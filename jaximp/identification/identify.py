@@ -393,9 +393,17 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         torque=np.concatenate([part.torque for part in parts], axis=1),
         reconstructed=np.concatenate([part.reconstructed for part in parts], axis=1),
         predicted=np.concatenate([part.predicted for part in parts], axis=1),
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        notes=tuple(_notes_side_by_side(parts)),
         reflexes=tuple(_reflexes_side_by_side(parts)),
     )
+
+
+def _notes_side_by_side(parts: list[Estimates]) -> Iterator[str]:
+    """What is said of every joint once, and of the others with a label."""
+    shared = set.intersection(*(set(part.notes) for part in parts))
+    yield from (note for note in parts[0].notes if note in shared)
+    for j, part in enumerate(parts):
+        yield from (f"joint {j + 1}: {note}" for note in part.notes if note not in shared)
 
 
 def _reflexes_side_by_side(parts: list[Estimates]) -> Iterator[Reflex]:
@@ -536,7 +544,7 @@ def _estimates(
         torque=torque,
         reconstructed=reconstructed,
         predicted=predicted,
-        notes=(*prepared.recording.notes, *filter(None, about), *changes(model, fit, side_by_side)),
+        notes=(*prepared.recording.notes, *filter(None, about), *changes(pipeline, fit, side_by_side)),
         reflexes=reflexes,
         misfits=misfits,
         bands=of_model.bands,

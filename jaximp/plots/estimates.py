@@ -457,7 +457,7 @@ def _band_panel(panel: Axes, found: ByFrequency, k: int, level: float) -> None:
     panel.set_title(with_unit(found.names[k], found.units[k]), loc="left")
     panel.set_xscale("log")
     panel.set_xlim(edges[0] / 1.1, edges[-1] * 1.1)
-    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if edges[-1] > 10 * edges[0] else (1, 1.5, 2, 3, 5, 7)))
     panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     panel.minorticks_off()
 

@@ -296,6 +296,9 @@ def _explained(content: dict[str, Any]) -> str:
         text += f", and {percent(held_out)} in the window that follows, which it has not seen"
         if vaf - held_out > 0.1:
             text += ". That is much less: the parameters change from window to window, or follow the noise"
+    unpredictive = content["windows"]["unpredictive"]
+    if unpredictive:
+        text += f". Of these windows {unpredictive} predict the torque of the next one worse than a constant would"
     return f"{text}."
 
 
@@ -444,6 +447,7 @@ def _result(estimates: Estimates) -> dict[str, Any]:
             "count": len(trusted),
             "trusted": int(trusted.sum()),
             "trusted_share": float(trusted.mean()),
+            "unpredictive": int(estimates.unpredictive.sum()),
             "verdicts": {
                 verdict: {"count": count, "share": count / len(trusted)}
                 for verdict, count in estimates.verdicts.counts().items()

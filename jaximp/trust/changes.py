@@ -34,19 +34,22 @@ def same_in_all(value: Numbers, stderr: Numbers, dof: Numbers) -> Change:
 
     The ends are those of the estimates after each was drawn to their mean, as far as its error says.
 
-    **Source:** Cochran 1937 for the statistic, Welch 1951 for its distribution where errors are known with few degrees
-    of freedom; DerSimonian and Laird 1986 for the variance of the change.
+    **Source:** Cochran 1937. Errors are known with few degrees of freedom: each Student's t counts as the normal
+    deviate that is as rare, which holds for any number of windows. (The F of Welch 1951 takes 300 constant windows of 8
+    degrees of freedom for a change at 1 % in 7 % of all cases.) The variance of the change is that of DerSimonian and
+    Laird 1986.
     """
-    from scipy.special import fdtrc
+    from scipy.special import chdtrc, ndtri, stdtr
 
-    count, weight = len(value), 1 / stderr**2
+    weight = 1 / stderr**2
     share = weight / weight.sum()
     mean = float(share @ value)
+    own = 1 - share
+    t = np.abs(value - mean) / (stderr * np.sqrt(own))
+    deviate = ndtri(np.maximum(stdtr(dof, -t), np.finfo(float).tiny))
+    p = float(chdtrc(len(value) - 1, own @ deviate**2))
     scatter = float(weight @ (value - mean) ** 2)
-    lost = float(((1 - share) ** 2 / dof).sum())
-    statistic = scatter / (count - 1) / (1 + 2 * (count - 2) / (count**2 - 1) * lost)
-    p = float(fdtrc(count - 1, (count**2 - 1) / (3 * lost), statistic))
-    variance = max(scatter - (count - 1), 0) / float(weight.sum() * (1 - share @ share))
+    variance = max(scatter - (len(value) - 1), 0) / float(weight @ own)
     drawn = mean + variance / (variance + stderr**2) * (value - mean)
     return Change(float(drawn.min()), float(drawn.max()), p)
 

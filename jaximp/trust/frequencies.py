@@ -18,6 +18,8 @@ from jaximp.types import Numbers
 
 BANDS = 4
 """Bands of frequencies with an equal share of the excitation."""
+LEAST = 0.1
+"""Share of the excitation of a band; what has less goes to its neighbour."""
 ENDS = 0.03
 """Share of the excitation that is left out at either end where a band is drawn."""
 LOST = 1e-9
@@ -102,7 +104,7 @@ def estimate_by_frequency(
     squares = (columns[..., shown] ** 2).sum(axis=(0, 2))
     excitation = (squares / squares.sum(axis=0)).mean(axis=1)
     cumulated = np.cumsum(excitation)
-    _, bands = np.unique((BANDS * (cumulated - excitation / 2)).astype(int), return_inverse=True)
+    bands = _split(excitation)
     count = int(bands[-1]) + 1
     if count < 2:
         return None
@@ -131,6 +133,18 @@ def estimate_by_frequency(
         generalised=whole,
         p=np.array([_same(apart[known[:, k], k], influence[known[:, k], :, k]) for k in range(len(shown))]),
     )
+
+
+def _split(excitation: Numbers) -> NDArray[np.int64]:
+    """(F,) the band of each frequency, from its share in the excitation; of a few lines there are fewer bands."""
+    band = np.minimum((BANDS * (np.cumsum(excitation) - excitation / 2)).astype(int), BANDS - 1)
+    labels, label, filled = [], 0, 0.0
+    for share in np.bincount(band, excitation, BANDS):
+        labels.append(label)
+        filled += share
+        if filled >= LEAST:
+            label, filled = label + 1, 0.0
+    return np.minimum(labels, max(label - 1, 0))[band]
 
 
 def _cosines(W: Numbers, windows: Sequence[OwnFit], window: int, every: int) -> tuple[Numbers, Numbers]:
