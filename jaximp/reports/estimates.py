@@ -80,8 +80,9 @@ CAPTIONS = {
     "that the model lacks. The estimated noise is what tells how far each frequency can be relied on.",
     "by_frequency": "Each parameter by bands of frequencies that excite the model equally. Ordinary least squares of "
     "filtered rows counts bands with much torque more, generalised least squares those with little noise: where the "
-    "parameter is the same at all frequencies both agree with every band. Hatched bands do not determine it. A "
-    "parameter that changes from window to window makes no interval longer.",
+    "parameter is the same at all frequencies both agree with every band. Hatched bands do not determine it. Inside "
+    "a band inertia and stiffness are harder to tell apart than over all of them. A parameter that changes from window "
+    "to window makes no interval longer.",
     "reflex": "What a stretch does to the torque as time goes by: the weight of every lag of the rectified velocity. "
     "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
     "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "

@@ -31,6 +31,7 @@ FIGURES = {
     "condition": plots.condition_over_time,
     "torque": plots.torque,
     "spectrum": plots.residual_spectrum,
+    "by_frequency": plots.by_frequency,
     "window_lengths": lambda estimates: plots.window_lengths([estimates, replace(estimates, window=4.0)]),
     "methods": lambda estimates: plots.methods([replace(estimates, method=1), replace(estimates, method=3)]),
 }
@@ -39,6 +40,7 @@ UNITS = {
     "condition": ("(1)", "middle of the window (s)"),
     "torque": ("torque (N m)", "residual (N m)", "time (s)"),
     "spectrum": ("[(N m)²/Hz]", "frequency (Hz)"),
+    "by_frequency": ("inertia (kg m²)", "stiffness (N m/rad)", "frequency (Hz)", "95% interval"),
     "window_lengths": ("stiffness (N m/rad)", "window length (s)", "(1)"),
     "methods": ("stiffness (N m/rad)", "middle of the window (s)"),
 }
@@ -70,6 +72,22 @@ def test_figure_renders_without_any_number(name: str, estimates: Estimates) -> N
     nothing = np.full_like(estimates.torque, np.nan)
     empty = replace(without_trust(estimates), fit=fit, torque=nothing, reconstructed=nothing, predicted=nothing)
     assert plots.png(FIGURES[name](replace(empty, held_out_vaf=np.full(len(empty.end), np.nan))))
+
+
+def test_bands_that_do_not_determine_a_parameter_are_hatched_and_joints_have_rows(estimates: Estimates) -> None:
+    (found,) = estimates.frequencies
+    value = found.value.copy()
+    value[-1, 0] = np.nan
+    one = plots.by_frequency(replace(estimates, frequencies=(replace(found, value=value),)))
+    assert "not determined" in words_on(one)
+    assert "not determined" not in words_on(
+        plots.by_frequency(replace(estimates, frequencies=(replace(found, value=0 * found.value),)))
+    )
+    two = plots.by_frequency(replace(estimates, frequencies=(found.of_joint(0), found.of_joint(1))))
+    assert len(two.axes) == 2 * len(one.axes)
+    assert "joint2 stiffness (N m/rad)" in words_on(two)
+    with pytest.raises(ValueError, match="were not split by frequency"):
+        plots.by_frequency(replace(estimates, frequencies=()))
 
 
 @pytest.mark.parametrize(

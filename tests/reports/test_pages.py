@@ -374,9 +374,9 @@ def test_figures_over_time_zoom_together(page: Browser) -> None:
 
 def test_paper_and_pages_without_scripts_show_the_pictures(page: Browser, written: Path) -> None:
     shown = "[...document.querySelectorAll('figure img')].map((one) => one.offsetHeight > 100)"
-    assert page.evaluate(shown) == [False, False, False, True]
+    assert page.evaluate(shown) == [False, False, False, True, True]
     page.call("Emulation.setEmulatedMedia", media="print")
-    assert page.evaluate(shown) == [True] * 4
+    assert page.evaluate(shown) == [True] * 5
     assert page.evaluate("document.getElementById('parameters').offsetHeight") == 0
     page.call("Emulation.setEmulatedMedia", media="")
     page.call("Emulation.setScriptExecutionDisabled", value=True)

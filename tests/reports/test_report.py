@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -17,8 +19,10 @@ from factories.estimates import JOB, identified, recording, without_trust
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import Job, parse_job
 from jaximp.reports import estimates as report
+from jaximp.trust.frequencies import ByFrequency
 from jaximp.types import Recording
 
+NONE = "No dependence on the frequency beyond error and 5 % was found"
 NASTY = "<script>alert(1)</script>"
 
 
@@ -43,7 +47,8 @@ def strict(text: str) -> Any:
 
 
 def test_all_files_are_there(folder: Path) -> None:
-    figures = {"parameters", "torque", "condition", "residual_spectrum", "window_lengths", "methods"}
+    figures = {"parameters", "torque", "condition", "residual_spectrum", "by_frequency", "window_lengths"}
+    figures |= {"methods"}
     tables = {"estimates.parquet", "estimates_method3.parquet", "summary.json", "report.html"}
     assert {path.name for path in folder.iterdir()} == tables | {f"{name}.png" for name in figures}
 
@@ -54,7 +59,7 @@ def test_report_needs_nothing_else(folder: Path) -> None:
     outside = re.sub(r"<script>.*?</script>", "", page, flags=re.S)
     assert not re.search(r"https?://|<link|<script src|@import|url\(", outside)
     sources = re.findall(r'src="([^"]{30})', outside)
-    assert len(sources) == 6
+    assert len(sources) == 7
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert len(page) < 2_000_000
 
@@ -140,3 +145,81 @@ def test_no_trusted_window_is_said_before_any_number(case: tuple[Job, Recording,
     content = strict((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert content["windows"]["trusted"] == 0
     assert content["parameters"]["stiffness"]["mean"] is None
+
+
+def of_bands(stiffness: list[float], p: float) -> ByFrequency:
+    """A stiffness beside a damping of 0.7 in all bands."""
+    value = np.column_stack([np.full(4, 0.7), stiffness])
+    edges, middle, whole = np.array([0.5, 2.0, 4.0, 8.0, 16.0]), np.array([1.0, 3.0, 6.0, 12.0]), np.array([0.7, 60.0])
+    names, units = ("damping", "stiffness"), ("N m s/rad", "N m/rad")
+    return ByFrequency(names, units, edges, middle, value, 0.1 * value, 11.0, whole, whole, np.array([0.4, p]))
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "p", "said"),
+    [
+        (
+            [60.0, 61.0, 59.0, 60.0],
+            0.5,
+            f"{NONE} of damping and stiffness.",
+        ),
+        (
+            [60.0, 65.0, 80.0, 75.0],
+            1e-5,
+            "Stiffness (60 around 1 Hz and 80 around 6 Hz, in N m/rad; p < 0.001) depends on the frequency. "
+            f"{NONE} of damping.",
+        ),
+        (
+            [60.0, math.nan, math.nan, math.nan],
+            math.nan,
+            f"{NONE} of damping. Whether stiffness does cannot be told: fewer than two bands determine it. "
+            "Left out, since the band does not determine it: stiffness at 2 to 16 Hz.",
+        ),
+        (
+            [math.nan, 60.0, math.nan, 60.0],
+            0.9,
+            f"{NONE} of damping and stiffness. Left out, since the band does not determine it: stiffness at 0.5 to 2 and "
+            "4 to 8 Hz.",
+        ),
+    ],
+    ids=["the same", "depends", "one band", "left out"],
+)
+def test_what_depends_on_the_frequency_is_said(stiffness: list[float], p: float, said: str) -> None:
+    assert report.frequencies_in_words(of_bands(stiffness, p)) == said
+
+
+def test_the_report_says_whether_estimates_depend_on_the_frequency(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert (
+        "No dependence on the frequency beyond error and 5 % was found" in page[page.index("Estimates by frequency") :]
+    )
+
+
+def test_windows_that_do_not_predict_the_next_are_counted(
+    case: tuple[Job, Recording, Estimates], tmp_path: Path
+) -> None:
+    job, source, estimates = case
+    held_out = np.where(np.cumsum(estimates.trusted) <= 3, -0.5, estimates.held_out_vaf)
+    report.write_results(tmp_path, [replace(estimates, held_out_vaf=held_out)], [], job, source)
+    assert strict((tmp_path / "summary.json").read_text(encoding="utf-8"))["windows"]["unpredictive"] == 3
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Of these windows 3 predict the torque of the next one worse than a constant would." in page
+
+
+def test_a_parameter_that_is_not_determined_is_said_in_the_table(
+    case: tuple[Job, Recording, Estimates], tmp_path: Path
+) -> None:
+    job, source, estimates = case
+    stderr = np.array(estimates.fit.stderr)
+    stderr[:, 0] = 0.3 * np.abs(estimates.value[:, 0])
+    loose = replace(estimates, fit=eqx.tree_at(lambda fit: fit.stderr, estimates.fit, stderr))
+    report.write_results(tmp_path, [loose], [], job, source)
+    determined = {
+        name: value["determined"]
+        for name, value in strict((tmp_path / "summary.json").read_text(encoding="utf-8"))["parameters"].items()
+    }
+    assert determined == {"inertia": False, "damping": True, "stiffness": True, "offset_torque": True}
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    answer = page[page.index("<table") : page.index("</table>")]
+    rows = {name: answer[answer.index(name) :].split("</tr>")[0] for name in ("inertia", "damping", "stiffness")}
+    assert ["not determined" in row for row in rows.values()] == [True, False, False]
