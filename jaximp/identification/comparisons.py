@@ -42,6 +42,7 @@ def by_frequency(pipeline: Pipeline, rows: Rows, white: White) -> tuple[ByFreque
         rate,
         parameters,
         limits.max_relative_stderr,
+        white.inflation,
     )
     return () if found is None else (found,)
 

@@ -77,13 +77,14 @@ def estimate_by_frequency(
     row_rate: float,
     parameters: dict[int, tuple[str, str]],
     largest_error: float,
+    inflation: Numbers | None = None,
 ) -> ByFrequency | None:
     """Split the excitation into `BANDS`, and estimate the parameters in each of them.
 
     **Arguments:** `white` and `filtered` columns (N, p) and torque (N,), in rows whose noise is white and as they were
     filtered; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one; `row_rate` [Hz];
     `parameters`, name and unit of those that may differ between the bands, by column; `largest_error`, as a share of a
-    parameter, with which a band determines it.
+    parameter, with which a band determines it; `inflation` (p,) by what the windows' standard errors grow.
 
     **Returns:** None where fewer than `FEWEST_COMPARED` windows are excited, which are cut into shorter ones where they
     are too few, or a single frequency excites them.
@@ -111,7 +112,8 @@ def estimate_by_frequency(
 
     own = np.array([one.inverse @ (one.Q.T @ y[one.part]) for one in windows])[:, shown]
     ordinary = np.array([np.linalg.lstsq(filtered[0][one.part], filtered[1][one.part])[0] for one in windows])[:, shown]
-    errors = [one.scale * every * (one.inverse[shown] ** 2).sum(axis=1) for one in windows]
+    errors = np.array([one.scale * every * (one.inverse[shown] ** 2).sum(axis=1) for one in windows])
+    errors *= 1.0 if inflation is None else inflation[shown] ** 2
     whole = own.mean(axis=0)
     found = [_band(columns[:, bands == b][..., shown], residual[:, bands == b]) for b in range(count)]
     apart, influence, promised = (np.stack(x) for x in zip(*found, strict=True))
@@ -119,7 +121,7 @@ def estimate_by_frequency(
     known = every * promised <= (largest_error * whole) ** 2
     scatter = (1 - 1 / len(windows)) * (influence**2).sum(axis=1)
     # What is left of the windows says nothing of their own parameters: the errors of both add up (Hausman 1978).
-    stderr = np.sqrt(scatter + np.sum(errors, axis=0) / len(windows) ** 2)
+    stderr = np.sqrt(scatter + errors.sum(axis=0) / len(windows) ** 2)
     edges, middle = _frequencies(cumulated, bands, step)
     return ByFrequency(
         names=tuple(name for name, _ in parameters.values()),

@@ -178,8 +178,8 @@ def of_bands(stiffness: list[float], p: float) -> ByFrequency:
         (
             [math.nan, 60.0, math.nan, 60.0],
             0.9,
-            f"{NONE} of damping and stiffness. Left out, since the band does not determine it: stiffness at 0.5 to 2 and "
-            "4 to 8 Hz.",
+            f"{NONE} of damping and stiffness. "
+            "Left out, since the band does not determine it: stiffness at 0.5 to 2 and 4 to 8 Hz.",
         ),
     ],
     ids=["the same", "depends", "one band", "left out"],
