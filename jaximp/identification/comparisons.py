@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,10 +28,13 @@ def compared(model: Model) -> list[int]:
     ]
 
 
-def by_frequency(pipeline: Pipeline, rows: Rows, white: White) -> tuple[ByFrequency, ...]:
+def by_frequency(pipeline: Pipeline, rows: Rows, several: Sequence[White]) -> tuple[ByFrequency, ...]:
     """What differs between frequencies, of one joint; parameters that are not compared keep what each window finds.
-    Empty where there is too little to compare."""
+    Empty for joints that share parameters, and where there is too little to compare."""
     model, limits = pipeline.model, pipeline.limits
+    if not several or model.n_joints > 1:
+        return ()
+    (white,) = several
     of_white, as_filtered = ((np.asarray(x.W), np.asarray(x.torque)) for x in (white, rows))
     rate = pipeline.sample_rate / pipeline.filters.decimate
     parameters = {k: (model.names[k], model.units[k]) for k in compared(model)}

@@ -7,13 +7,13 @@ change from window to window does not pass for a dependence on the frequency.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.trust.score_tests import FAMILYWISE, FEWEST_COMPARED, SHARE, OwnFit, excited, fit_windows
+from jaximp.least_squares.disjoint import DisjointFit, fit_disjoint
+from jaximp.trust.score_tests import FAMILYWISE, FEWEST_COMPARED, SHARE, with_say
 from jaximp.types import Numbers
 
 BANDS = 4
@@ -92,36 +92,39 @@ def estimate_by_frequency(
     **Source:** band spectrum regression, Engle 1974; errors from leaving out one window after the other;
     differences between bands by Hotelling's test.
     """
-    W, y = white
-    windows = excited(list(fit_windows(W, y, valid, window, every)))
-    if 0 < len(windows) < FEWEST_COMPARED:
-        window //= -(-FEWEST_COMPARED // len(windows))
-        windows = excited(list(fit_windows(W, y, valid, window, every))) if window else []
-    if len(windows) < FEWEST_COMPARED:
+    (W, y), as_filtered = ((np.where(valid[:, None], W, 0), np.where(valid, y, 0)) for W, y in (white, filtered))
+    fit = fit_disjoint(W, y, valid, window)
+    chosen = with_say(fit, every)
+    if 0 < len(chosen) < FEWEST_COMPARED:
+        window //= -(-FEWEST_COMPARED // len(chosen))
+        fit = fit_disjoint(W, y, valid, window)
+        chosen = with_say(fit, every)
+    count = len(chosen)
+    if count < FEWEST_COMPARED:
         return None
     shown = np.array(list(parameters))
-    columns, residual = _cosines(W, windows, window, every)
+    scale = fit.rss[chosen] / (fit.rows[chosen] - every * W.shape[1])
+    columns, residual = _cosines(_cut(W, window)[chosen], fit.residual[chosen], scale, every)
     step = row_rate / every / (2 * columns.shape[1])
     squares = (columns[..., shown] ** 2).sum(axis=(0, 2))
     excitation = (squares / squares.sum(axis=0)).mean(axis=1)
     cumulated = np.cumsum(excitation)
     bands = _split(excitation)
-    count = int(bands[-1]) + 1
-    if count < 2:
+    if bands[-1] == 0:
         return None
 
-    own = np.array([one.inverse @ (one.Q.T @ y[one.part]) for one in windows])[:, shown]
-    ordinary = np.array([np.linalg.lstsq(filtered[0][one.part], filtered[1][one.part])[0] for one in windows])[:, shown]
-    errors = np.array([one.scale * every * (one.inverse[shown] ** 2).sum(axis=1) for one in windows])
+    own = _parameters(fit, W, y)[chosen][:, shown]
+    ordinary = _parameters(fit_disjoint(*as_filtered, valid, window), *as_filtered)[chosen][:, shown]
+    errors = scale[:, None] * every * (fit.inverse[chosen][:, shown] ** 2).sum(axis=2)
     errors *= 1.0 if inflation is None else inflation[shown] ** 2
     whole = own.mean(axis=0)
-    found = [_band(columns[:, bands == b][..., shown], residual[:, bands == b]) for b in range(count)]
+    found = [_band(columns[:, bands == b][..., shown], residual[:, bands == b]) for b in range(bands[-1] + 1)]
     apart, influence, promised = (np.stack(x) for x in zip(*found, strict=True))
     # Not by the scatter, which is small by luck where few windows are: what is chosen for that would be too sure.
     known = every * promised <= (largest_error * whole) ** 2
-    scatter = (1 - 1 / len(windows)) * (influence**2).sum(axis=1)
+    scatter = (1 - 1 / count) * (influence**2).sum(axis=1)
     # What is left of the windows says nothing of their own parameters: the errors of both add up (Hausman 1978).
-    stderr = np.sqrt(scatter + errors.sum(axis=0) / len(windows) ** 2)
+    stderr = np.sqrt(scatter + errors.sum(axis=0) / count**2)
     edges, middle = _frequencies(cumulated, bands, step)
     return ByFrequency(
         names=tuple(name for name, _ in parameters.values()),
@@ -130,7 +133,7 @@ def estimate_by_frequency(
         middle=middle,
         value=np.where(known, whole + apart, np.nan),
         stderr=np.where(known, stderr, np.nan),
-        dof=len(windows) - 1.0,
+        dof=count - 1.0,
         ordinary=ordinary.mean(axis=0),
         generalised=whole,
         p=np.array([_same(apart[known[:, k], k], influence[known[:, k], :, k]) for k in range(len(shown))]),
@@ -149,16 +152,28 @@ def _split(excitation: Numbers) -> NDArray[np.int64]:
     return np.minimum(labels, max(label - 1, 0))[band]
 
 
-def _cosines(W: Numbers, windows: Sequence[OwnFit], window: int, every: int) -> tuple[Numbers, Numbers]:
-    """Columns (K, F, every, p) and residuals (K, F, every) of K windows at F frequencies, divided by their noise."""
+def _cut(x: Numbers, window: int) -> Numbers:
+    """(K, S, ...) windows of (N, ...) rows."""
+    count = len(x) // window
+    return x[: count * window].reshape(count, window, *x.shape[1:])
+
+
+def _parameters(fit: DisjointFit, W: Numbers, y: Numbers) -> Numbers:
+    """(K, p) of every window."""
+    torque = _cut(y, fit.residual.shape[1])[..., None]
+    return (fit.inverse @ (fit.orthonormal(W).swapaxes(1, 2) @ torque))[..., 0]
+
+
+def _cosines(columns: Numbers, residual: Numbers, scale: Numbers, every: int) -> tuple[Numbers, Numbers]:
+    """Columns (K, F, every, p) and residuals (K, F, every) of K windows at F frequencies, divided by their noise, whose
+    variance is `scale` (K,)."""
     from scipy.fft import dct
 
-    padded = -(-window // every) * every
-    rows = np.zeros((len(windows), padded, W.shape[1] + 1))
-    for z, one in zip(rows, windows, strict=True):
-        at = one.part - one.part[0] // window * window
-        z[at] = np.column_stack([W[one.part], one.residual]) / np.sqrt(one.scale)
-    found = dct(rows.reshape(len(windows), padded // every, every, -1), axis=1, norm="ortho")
+    windows, rows, p = columns.shape
+    behind = -rows % every
+    z = np.concatenate([columns, residual[..., None]], axis=2) / np.sqrt(scale)[:, None, None]
+    z = np.pad(z, ((0, 0), (0, behind), (0, 0))).reshape(windows, -1, every, p + 1)
+    found = dct(z, axis=1, norm="ortho")
     return found[..., :-1], found[..., -1]
 
 

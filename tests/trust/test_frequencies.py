@@ -116,7 +116,9 @@ def test_few_windows_are_cut_and_too_few_rows_give_nothing() -> None:
     assert found(W, y).dof == 7
     every_row = np.ones(len(y), bool)
     assert estimate_by_frequency((W, y), (W, y), every_row & False, WINDOW, 1, RATE, PARAMETERS, 0.2) is None
-    assert estimate_by_frequency((W[:12], y[:12]), (W, y), every_row[:12], 12, 1, RATE, PARAMETERS, 0.2) is None
+    assert (
+        estimate_by_frequency((W[:12], y[:12]), (W[:12], y[:12]), every_row[:12], 12, 1, RATE, PARAMETERS, 0.2) is None
+    )
 
 
 def test_one_frequency_has_no_bands() -> None:
