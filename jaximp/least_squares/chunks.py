@@ -76,6 +76,15 @@ class Task(NamedTuple):
         """How many windows lie in so many rows, those before the recording among them."""
         return (rows - self.window) // self.plan.step + 1
 
+    def of_chunk(self, first: Any) -> Task:
+        """The task of the chunk whose windows begin with the `first`."""
+        if self.wanted is None:
+            return self
+        xp: Any = jnp if is_traced(first, self.wanted.level) else np
+        level = self.wanted.level
+        at = xp.minimum(first + np.arange(self.plan.windows), len(level) - 1)
+        return self._replace(wanted=self.wanted._replace(level=level[at]))
+
 
 def make_task(
     window: int,
@@ -98,13 +107,16 @@ def make_task(
 
 
 def make_adaptive_task(
-    lengths: NDArray[np.int64], step: int, outputs: int, stderr: Any, cond: Any, noise: Any, weighted: bool
+    lengths: NDArray[np.int64], step: int, outputs: int, wanted: tuple[Any, Any, Any], noise: Any, weighted: bool
 ) -> Task:
-    """Sizes of a chunk for windows that each are as long as they need; lengths in steps."""
+    """Sizes of a chunk for windows that each are as long as they need; lengths in steps.
+
+    **Arguments:** `wanted` as the last fields of `Wanted`, with the level for every step of the recording.
+    """
     room = _rounded(int(lengths[-1]))
     lags = 0 if noise is None else len(noise)
     plan = Plan(step, 1, max(LANES[True], room), room, outputs, True, weighted, lags)
-    return Task(plan, room * step, noise, Wanted(lengths, stderr, cond))
+    return Task(plan, room * step, noise, Wanted(lengths, *wanted))
 
 
 def _rounded(n: int) -> int:
@@ -173,13 +185,15 @@ def solve_traced(recording: Any, task: Task) -> Any:
     behind = max(0, (n_chunks - 1) * plan.advance + plan.rows - len(y) - task.before)
     columns, scale = jnp.pad(columns, ((0, 0), (task.before, behind))), jnp.pad(scale, (task.before, behind))
 
-    def solve(start: Array) -> tuple[ChunkFit, Array]:
+    def solve(chunk: Array) -> tuple[ChunkFit, Array]:
+        start = chunk * plan.advance
         rows = lax.dynamic_slice_in_dim(columns, start, plan.rows, axis=1)
-        return _solve_chunk(task, rows, lax.dynamic_slice_in_dim(scale, start, plan.rows))
+        return _solve_chunk(
+            task.of_chunk(chunk * plan.windows), rows, lax.dynamic_slice_in_dim(scale, start, plan.rows)
+        )
 
-    starts = jnp.arange(n_chunks) * plan.advance
     batch = 1 if jax.default_backend() == "cpu" else n_chunks
-    solved = lax.map(solve, starts, batch_size=batch)
+    solved = lax.map(solve, jnp.arange(n_chunks), batch_size=batch)
     fit, length = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n_windows], solved)
     return _finished(_repaired_traced(fit, length, task, columns, scale), length, task, 0)
 
@@ -290,7 +304,7 @@ def _solve_rows(task: Task, first: int, parts: list[Piece], skipped: int = 0) ->
     if not scale[skipped:at].all():
         columns[:, scale == 0] = 0  # whatever a masked sample holds
     n_windows = min(plan.windows, task.windows(at))
-    solved = _compiled(plan)(columns, scale, *task[1:])
+    solved = _compiled(plan)(columns, scale, *task.of_chunk(first)[1:])
     fit, length = jax.tree.map(lambda x: np.asarray(x)[:n_windows], solved)
     return _finished(_repaired(fit, length, task, columns, scale), length, task, first)
 

@@ -46,6 +46,11 @@ from jaximp.least_squares.fits import ChunkFit, estimates_of, for_prediction, in
 from jaximp.least_squares.sums import Plan, features_of, first_windows, in_blocks, products, squared_norms, sum_of_rows
 from jaximp.numerics.compilation import keep
 from jaximp.numerics.lanes import Rows
+from jaximp.numerics.linear_algebra import root
+
+SURPRISE = 3.0
+"""Standard deviations by which the variance of a window's residuals may lie above what is wanted: one window in a few
+hundred does so by chance."""
 
 
 def solve_chunk(
@@ -77,7 +82,7 @@ def solve_chunk(
 
     def solve(sums: Rows, peak: Array, outside: Outside | None, shift: Array | int) -> tuple[ChunkFit, Array]:
         across = None if ends is None or outside is None else across_ends(ends, outside, plan, shift, p)
-        return estimates_of(plan, p, R, sums, peak, noise, across), for_prediction(sums, p, plan)
+        return estimates_of(plan, p, R, sums, peak, noise, across)[0], for_prediction(sums, p, plan)
 
     def advance(
         state: tuple[Rows, Array, Outside | None], step: tuple[Array, Array, Array]
@@ -114,6 +119,8 @@ class Wanted(NamedTuple):
     """(p,) largest standard errors."""
     cond: Any
     """() largest condition number."""
+    level: Any
+    """(K,) variance of the noise around the end of every window."""
 
 
 def solve_shortest(
@@ -168,7 +175,7 @@ class _Growing:
         both = self.ends((self.plan.room - length) * self.plan.block), self.last
         return across_ends(both, from_outside(both, self.plan, self.noise, self.p), self.plan, 0, self.p)
 
-    def fit(self, total: Array, across: Rows | None) -> ChunkFit:
+    def fit(self, total: Array, across: Rows | None) -> tuple[ChunkFit, Array]:
         sums = keep(tuple(jnp.split(total, self.split)))
         return estimates_of(self.plan, self.p, self.R, sums, squared_norms(sums, self.p), self.noise, across)
 
@@ -184,7 +191,7 @@ def _search(growing: _Growing, wanted: Wanted) -> tuple[ChunkFit, Array]:
     def grow(before: Array, total: Array) -> Array:
         return total + growing.block(before)
 
-    def fit_of(length: Array, total: Array) -> ChunkFit:
+    def fit_of(length: Array, total: Array) -> tuple[ChunkFit, Array]:
         return growing.fit(total, growing.across(length))
 
     def unfinished(state: tuple[Array, Array, Array, ChunkFit]) -> Array:
@@ -194,13 +201,13 @@ def _search(growing: _Growing, wanted: Wanted) -> tuple[ChunkFit, Array]:
         k, total, taken, found = state
         length = wanted.blocks[k]
         total = keep(lax.fori_loop(jnp.where(k > 0, wanted.blocks[k - 1], 0), length, grow, total))
-        fit = fit_of(length, total)
-        better = (taken == 0) & _meets(fit, wanted)
+        fit, variance = fit_of(length, total)
+        better = (taken == 0) & _meets(fit, variance, wanted)
         found = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, found)
         return keep((k + 1, total, jnp.where(better, length, taken), found))
 
     none, total = jnp.zeros((), wanted.blocks.dtype), jnp.zeros_like(growing.blocks[:, :lanes])
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fit_of, none, total))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fit_of, none, total)[0])
     state = none, total, jnp.zeros(lanes, wanted.blocks.dtype), nothing
     _, _, taken, found = lax.while_loop(unfinished, lengthen, state)
     return growing.finished(found, taken), taken
@@ -217,12 +224,18 @@ def _of_lengths(growing: _Growing, taken: Array, lengths: Array) -> ChunkFit:
 
     total = lax.fori_loop(0, growing.plan.room, grow, jnp.zeros_like(growing.blocks[:, : growing.plan.lanes]))
     across = jax.tree.map(jnp.zeros_like, growing.across(lengths[0]))
-    return growing.finished(growing.fit(total, lax.scan(choose, across, lengths)[0]), taken)
+    return growing.finished(growing.fit(total, lax.scan(choose, across, lengths)[0])[0], taken)
 
 
-def _meets(fit: ChunkFit, wanted: Wanted) -> Array:
-    """Whether a window is long enough, and its standard error more than rounding."""
+def _meets(fit: ChunkFit, variance: Array, wanted: Wanted) -> Array:
+    """Whether a window is long enough, and its standard error more than rounding.
+
+    Its motion and the noise around it decide. Its own residuals do not (the first window that they make look sure is
+    one whose residuals are small by chance), unless they are so large that the model changes within it.
+    """
     assert fit.statistics is not None
     accurate = fit.share > jnp.sqrt(jnp.finfo(fit.theta.dtype).eps)
-    sure = (fit.statistics.stderr <= wanted.stderr[:, None]).all(axis=0)
+    limit, stderr, dof = wanted.stderr[:, None], fit.statistics.stderr, jnp.maximum(fit.statistics.dof, 1)
+    expected = stderr * root(wanted.level) <= limit * root(variance)
+    sure = (expected & (stderr <= limit * jnp.sqrt(1 + SURPRISE * jnp.sqrt(2 / dof)))).all(axis=0)
     return fit.solvable & accurate & sure & (fit.statistics.sigma_max <= wanted.cond * fit.statistics.sigma_min)

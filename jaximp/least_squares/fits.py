@@ -69,15 +69,15 @@ class Held(NamedTuple):
 
 def estimates_of(
     plan: Plan, p: int, R: Array, sums: Rows, peak: Array, noise: Array | None, across: Rows | None
-) -> ChunkFit:
-    """Estimates of one window in every lane, from its sums."""
+) -> tuple[ChunkFit, Array]:
+    """Estimates of one window in every lane, from its sums, and the variance of the noise that the residuals show."""
     triangle = cholesky(sums[: p + 1])
     pivots = jnp.stack([row[0] for row in triangle[:p]])
     inner = substitute(triangle, p)
     theta, solvable = jnp.stack(inner), _solvable(pivots, sums, R, plan.rows)
     share = (pivots**2 / jnp.where(peak > 0, peak, 1)).min(axis=0)
     if not plan.statistics:
-        return ChunkFit(theta, solvable, share)
+        return ChunkFit(theta, solvable, share), jnp.zeros_like(share)
     rss = (R[p, p] * triangle[p][0]) ** 2
     weight, vaf, _, samples = _residuals(plan, rss, inner, R, sums)
     alone = tuple(row[: p - i] for i, row in enumerate(triangle[:p]))
@@ -85,12 +85,12 @@ def estimates_of(
     sigma_max, sigma_min = extreme_singular_values(given, inverse)
     norm = jnp.sqrt((inverse**2).sum(axis=1))
     if across is None or noise is None:
-        dof = samples - p
+        dof = trace = samples - p
         stderr = jnp.where(dof > 0, norm * root(rss / jnp.where(dof > 0, dof, 1)), jnp.nan)
     else:
-        stderr, dof = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, weight)
+        stderr, dof, trace = _coloured(plan, sums, across, noise, own_inverse, inverse, rss, weight)
     statistics = Statistics(stderr, dof, norm, sigma_max, sigma_min, divided(rss, weight), vaf, samples)
-    return ChunkFit(theta, solvable, share, statistics)
+    return ChunkFit(theta, solvable, share, statistics), divided(rss, trace)
 
 
 def _solvable(pivots: Array, sums: Rows, R: Array, rows: int) -> Array:
@@ -214,8 +214,9 @@ def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Arra
 
 def _coloured(
     plan: Plan, sums: Rows, across: Rows, noise: Array, own: Array, inverse: Array, rss: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them."""
+) -> tuple[Array, Array, Array]:
+    """Standard errors and degrees of freedom for noise of this autocovariance, as `least_squares` has them, and what
+    the residuals' sum of squares would be for noise of just this autocovariance."""
     p = len(own)
     within = keep(tuple(all_ - lost for all_, lost in zip(sums[-len(across) :], across, strict=True)))
     once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
@@ -226,7 +227,7 @@ def _coloured(
     square = squares - 2 * (twice * gram).sum(axis=(0, 1)) + (shape * shape).sum(axis=(0, 1))
     spread = keep(jnp.stack([sum_of(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, 1))
-    return jnp.where(trace > 0, root(variance), jnp.nan), divided(trace**2, square)
+    return jnp.where(trace > 0, root(variance), jnp.nan), divided(trace**2, square), trace
 
 
 def _full(triangle: Rows) -> Array:

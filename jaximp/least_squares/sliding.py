@@ -33,6 +33,7 @@ from jaximp.least_squares.window import (
     root_of_weights,
     scatter,
     solve_window,
+    squares_left,
     variance_accounted_for,
 )
 from jaximp.numerics.compilation import compiled, is_traced, require_numbers
@@ -45,6 +46,14 @@ BATCH_NUMBERS = 4_000_000
 
 FROM_CHUNKS = 200_000_000
 """So many numbers in all windows together, and sums that windows share are worth the time they take to compile."""
+
+
+FEWEST_ROWS = 4
+"""For each parameter: from fewer a piece of the recording tells little of the noise."""
+
+
+CHANGES = 4.0
+"""How many times the median of its neighbours a piece's variance must be to tell nothing of the noise."""
 
 
 def window_starts(n_samples: int, window: int, step: int = 1) -> NDArray[np.int64]:
@@ -177,8 +186,11 @@ def adaptive_least_squares(
     of the step, and rise by a twentieth or one step.
 
     **Returns:** a `SlidingFit` whose windows end `step` apart and differ in `first`; NaN where none of them is sure
-    enough. Since a change of the joint within a window spoils the fit, and with it the standard error, a window rarely
-    reaches back across one.
+    enough. A window is as long as its motion and the noise around it demand; its own residuals have no say, as the
+    first window that they make look sure is one whose residuals happen to be small, and its interval too narrow. So
+    `stderr` is met in the mean, and a single window's may lie above it. Where it does by more than chance would have it
+    (three standard deviations) the window is not taken: a change of the joint within a window spoils the fit, so that a
+    window rarely reaches back across one.
 
     **Raises:** `ValueError` as `sliding_least_squares`, and for noise that is correlated over too many samples.
 
@@ -199,8 +211,43 @@ def adaptive_least_squares(
     count = 1 + math.ceil(math.log(most / few) / math.log(1.05))
     lengths = np.unique(np.geomspace(few, most, count).round().astype(int))
     noise = _noise_in_sums(noise, shortest, n, "a fixed window")
-    task = make_adaptive_task(lengths, step * n, n, stderr, cond, noise, scale.dtype != bool)
+    piece = min(len(W), max(few * step, -(-FEWEST_ROWS * p // n)))
+    level = _noise_level(W, y, scale, noise, jnp.arange(len(W) // step), piece, most * step, step)
+    task = make_adaptive_task(lengths, step * n, n, (stderr, cond, _numbers(level)), noise, scale.dtype != bool)
     return jax.tree.map(lambda x: x[few - 1 :], _from_shared_sums(W, y, scale, task))
+
+
+@partial(compiled, static_argnames=("piece", "around", "step"))
+def _noise_level(
+    W: Array, y: Array, scale: Array, noise: AnyArray | None, ends: Array, piece: int, around: int, step: int
+) -> Array:
+    """Variance of the noise up to `around` samples before and after the end of every step, in units of `noise`.
+
+    From pieces of the recording with parameters of their own, as a change of the joint is no noise.
+    """
+    known = None if noise is None else jnp.asarray(noise)
+
+    def one(start: Array) -> tuple[Array, Array]:
+        rows, torque, counts = slice_window((W, y, scale), start, piece)
+        return squares_left(rows, torque, counts, known)
+
+    starts = jnp.arange(0, len(W) - piece + 1, piece)
+    squares, expected = map_windows(one, starts, piece * math.prod(W.shape[1:]))
+    near = -(-around // piece)
+    some = jnp.arange(len(starts))[:, None] + np.arange(-near, near + 1)
+    inside = (some >= 0) & (some < len(starts))
+    squares, expected = (jnp.where(inside, x[some % len(starts)], 0) for x in (squares, expected))
+    variance = jnp.where(expected > 0, squares / jnp.where(expected > 0, expected, 1), jnp.nan)
+    # A piece in which the joint changes stands out.
+    usual = variance <= CHANGES * jnp.nanmedian(variance, axis=1, keepdims=True)
+    squares, expected = (jnp.where(usual, x, 0).sum(axis=1) for x in (squares, expected))
+    level = jnp.where(expected > 0, squares / jnp.where(expected > 0, expected, 1), jnp.inf)
+    return level[jnp.minimum(((ends + 1) * step - 1) // piece, len(starts) - 1)]
+
+
+def _numbers(x: Array) -> Any:
+    """In numpy's memory, outside of compiled programs."""
+    return x if is_traced(x) else np.asarray(x)
 
 
 def in_samples(name: str, value: float | None, sample_rate: float | None) -> int:

@@ -134,6 +134,22 @@ def solve_window(W: AnyArray, y: AnyArray, scale: AnyArray, noise: AnyArray | No
     )
 
 
+def squares_left(W: AnyArray, y: AnyArray, scale: AnyArray, noise: AnyArray | None) -> tuple[Array, Array]:
+    """Sum of squares of a window's residuals, and what it would be for noise of just this autocovariance (without one,
+    white and of variance one); arguments as in `solve_window`. Columns may depend on each other."""
+    scale = jnp.asarray(scale, W.dtype)
+    rows = jnp.where(scale[..., None] > 0, W * scale[..., None], 0).reshape(-1, W.shape[-1])
+    torque = jnp.where(scale > 0, y * scale, 0).ravel()
+    Q = orthonormal(rows)[0]
+    residual = torque - Q @ (Q.T @ torque)
+    if noise is None:
+        expected = (scale > 0).sum() - (Q**2).sum()
+    else:
+        inner, weighted = _shaped(Q, scale.reshape(len(W), -1), noise)[1:]
+        expected = weighted - jnp.trace(inner)
+    return residual @ residual, expected
+
+
 def variance_accounted_for(
     torque: Num[AnyArray, "S *n"], residual: Num[AnyArray, "S *n"], weight: Num[AnyArray, "S *n"]
 ) -> Float[Array, ""]:
@@ -203,16 +219,21 @@ def _coloured(Q: Array, rss: Array, scale: Array, noise: Array) -> tuple[Array, 
 
     The equations were multiplied by `scale`, and so is the noise in them.
     """
-    n_samples, n_outputs = scale.shape
-    p, weight = Q.shape[1], scale**2
-    blocks = (Q.reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(n_samples, n_outputs * p)
-    shaped = (_covariance_times(noise, blocks).reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(-1, p)
-    inner = Q.T @ shaped
-    level = noise[0] if noise.ndim == 1 else jnp.diagonal(noise)[:, None]
-    trace = (weight * level).sum() - jnp.trace(inner)
+    shaped, inner, weighted = _shaped(Q, scale, noise)
+    trace, weight = weighted - jnp.trace(inner), scale**2
     squared = (weight * _covariance_times(noise**2, weight)).sum()
     trace_of_square = squared - 2 * (shaped * shaped).sum() + (inner * inner).sum()
     return inner * rss / trace, trace**2 / trace_of_square
+
+
+def _shaped(Q: Array, scale: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """The noise's covariance times Q, the same along Q, and its trace; in the equations as they were multiplied."""
+    n_samples, n_outputs = scale.shape
+    p = Q.shape[1]
+    blocks = (Q.reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(n_samples, n_outputs * p)
+    shaped = (_covariance_times(noise, blocks).reshape(n_samples, n_outputs, p) * scale[..., None]).reshape(-1, p)
+    level = noise[0] if noise.ndim == 1 else jnp.diagonal(noise)[:, None]
+    return shaped, Q.T @ shaped, (scale**2 * level).sum()
 
 
 def _covariance_times(noise: Array, x: Float[Array, "S k"]) -> Float[Array, "S k"]:

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import toeplitz
 
 from jaximp.least_squares import sliding as windows
 from jaximp.least_squares.chunks import lags_for_sums
 from jaximp.least_squares.sliding import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
-from jaximp.least_squares.window import SlidingFit
+from jaximp.least_squares.window import SlidingFit, confidence_interval
 
 Numbers = NDArray[np.float64]
 
@@ -125,17 +126,78 @@ def test_the_shortest_window_that_is_sure_enough(outputs: tuple[int, ...], noise
     assert lengths[-1] == 300
     # What each window is, and that the next shorter length is not enough.
     found = {n: one_by_one(W, y, int(n), noise=noise, room=300) for n in lengths}
+    level = noise_around(W, y, noise, 40, 300)
+
+    def enough(n: int, start: int) -> bool:
+        expected = np.sqrt(level[(start + n - 1) // 40]) * unit_stderr(W[start : start + n], noise)[1]
+        surprise = np.sqrt(1 + 3 * np.sqrt(2 / found[n].dof[start]))
+        return bool(expected <= wanted[1] and found[n].stderr[start, 1] <= surprise * wanted[1])
+
     for m in np.flatnonzero(complete):
-        n, start = length[m], int(fit.first[m])
-        expected = jax.tree.map(itemgetter(start), found[n])
+        n, start = int(length[m]), int(fit.first[m])
         if np.isnan(fit.theta[m]).any():
             assert n == 300
-            assert expected.stderr[1] > wanted[1]
+            assert not enough(n, start)
             continue
-        assert_same(jax.tree.map(itemgetter(m), fit), expected, y)
-        assert expected.stderr[1] <= wanted[1]
+        assert_same(jax.tree.map(itemgetter(m), fit), jax.tree.map(itemgetter(start), found[n]), y)
+        assert enough(n, start)
         for shorter in lengths[lengths < n][-1:]:
-            assert found[shorter].stderr[start + n - shorter, 1] > wanted[1]
+            assert not enough(int(shorter), start + n - int(shorter))
+
+
+def covariance_of_rows(noise: Numbers | None, samples: int, outputs: int) -> Numbers:
+    lags = np.pad([1.0] if noise is None else noise, (0, samples))[:samples]
+    return np.kron(toeplitz(lags), np.eye(outputs))
+
+
+def unit_stderr(W: Numbers, noise: Numbers | None) -> Numbers:
+    """Of the estimates of a window, for noise of just this autocovariance."""
+    C = covariance_of_rows(noise, len(W), W[0].size // W.shape[-1])
+    A = np.linalg.pinv(W.reshape(len(C), -1))
+    return np.sqrt(np.diag(A @ C @ A.T))
+
+
+def noise_around(W: Numbers, y: Numbers, noise: Numbers | None, piece: int, around: int) -> Numbers:
+    """Of every piece, the noise's variance from the residuals of the pieces around it."""
+    squares, expected = [], []
+    for start in range(0, len(W) - piece + 1, piece):
+        rows, torque = W[start : start + piece].reshape(-1, W.shape[-1]), y[start : start + piece].ravel()
+        M = np.eye(len(rows)) - rows @ np.linalg.pinv(rows)
+        squares.append(((M @ torque) ** 2).sum())
+        expected.append(np.trace(M @ covariance_of_rows(noise, piece, len(rows) // piece)))
+    near, level = -(-around // piece), []
+    for k in range(len(squares)):
+        some = slice(max(k - near, 0), k + near + 1)
+        each, of = np.array(squares[some]), np.array(expected[some])
+        usual = each / of <= 4 * np.median(each / of)
+        level.append(each[usual].sum() / of[usual].sum())
+    return np.array([*level, level[-1]])
+
+
+def test_the_shortest_windows_are_as_sure_as_they_say() -> None:
+    """Were a window's own residuals asked, intervals of the shortest tenth would hold the truth in 84 %."""
+    random, n, truth = np.random.default_rng(5), 60_000, np.array([1.0, 2.0])
+    W = random.normal(size=(n, 2))
+    fit = adaptive_least_squares(W, W @ truth + random.normal(size=n), np.full(2, 0.3), 8, 80, step=2)
+    found = jax.tree.map(lambda x: np.asarray(x)[40::10], fit)
+    assert np.isfinite(found.dof).all()
+    length = found.last - found.first
+    shortest = np.argsort(length, kind="stable")[: len(length) // 10]
+    low, high = confidence_interval(found)
+    held = (low <= truth) & (truth <= high)
+    assert 0.91 < held[shortest].mean() < 0.98  # 600 intervals: four standard deviations below
+    assert 0.94 < held.mean() < 0.96
+
+
+def test_no_window_reaches_far_across_a_change() -> None:
+    random, n = np.random.default_rng(6), 3000
+    W, after = random.normal(size=(n, 2)), np.arange(n) >= 1500
+    y = W[:, 0] + np.where(after, 16.0, 1.0) * W[:, 1] + random.normal(size=n)
+    fit = adaptive_least_squares(W, y, np.full(2, 0.3), 8, 80, step=2)
+    share = (fit.last - 1499) / (fit.last - fit.first + 1)
+    far = (share > 0.25) & (share < 0.75) & np.isfinite(fit.dof)
+    assert not far.any()
+    assert np.isfinite(fit.theta[(fit.last >= 1530) & (fit.last < 1540)]).all()
 
 
 @pytest.mark.slow
