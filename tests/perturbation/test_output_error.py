@@ -57,7 +57,23 @@ def lanes_of(perturbed: Trials) -> Any:
     return module._in_lanes(perturbed, GEOMETRY, ARM.handle, module._Bins.of(RATE, 0.115))
 
 
-THETA = np.array([2.4, 1.2, 1.1, 1.4, 29.0, 14.0, 17.0, *np.linspace(-0.3, 0.3, 7), 0.19, 0.074, 0.084, 3.3e-4])
+THETA = np.array(
+    [
+        2.4,
+        1.2,
+        1.1,
+        1.4,
+        29.0,
+        14.0,
+        17.0,
+        *np.linspace(-0.3, 0.3, 7),
+        *np.linspace(-0.03, 0.03, 6),
+        0.19,
+        0.074,
+        0.084,
+        3.3e-4,
+    ]
+)
 
 
 @pytest.mark.slow
@@ -65,9 +81,9 @@ def test_the_derivative_of_the_deviation_is_its_difference(trials: Simulated) ->
     lanes = lanes_of(trials.perturbed)
     of = eqx.filter_jit(module._deviation_in_bins)
     _, S = module._linearised(jnp.asarray(THETA), lanes, GEOMETRY, ARM.handle)
-    for k in range(18):
+    for k in range(24):
         h = 1e-5 if k < module.PLACES.delay else 1e-7
-        ahead, behind = (of(jnp.asarray(THETA + step * np.eye(18)[k]), lanes, GEOMETRY, ARM.handle) for step in (h, -h))
+        ahead, behind = (of(jnp.asarray(THETA + step * np.eye(24)[k]), lanes, GEOMETRY, ARM.handle) for step in (h, -h))
         np.testing.assert_allclose(
             S[..., k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-6 * np.abs(S[..., k]).max()
         )
@@ -95,11 +111,13 @@ def test_an_impedance_without_noise_is_given_back(trials: Simulated, monkeypatch
     # The movement that would have been is known, so that nothing but the fit is left to err.
     monkeypatch.setattr(module.Continuation, "predict", lambda prior, past: measured)
     monkeypatch.setattr(module, "TREND", (1e4, 1e4, 1e4))
+    monkeypatch.setattr(module, "BEND", 1e4)
     monkeypatch.setattr(module, "SMALL_STEP", 1e-9)
     fit = output_error(perturbed, trials.unperturbed, GEOMETRY, ARM.handle, ARM.inertia)
     np.testing.assert_allclose(fit.D.ravel(), theta[:4], rtol=1e-6)
     np.testing.assert_allclose(fit.K.ravel(), theta[[4, 5, 5, 6]], rtol=1e-6)
     np.testing.assert_allclose(fit.kappa, theta[module.PLACES.kappa], atol=1e-5)
+    np.testing.assert_allclose(fit.bend, theta[module.PLACES.bend], atol=1e-5)
     assert abs(fit.delay) < 1e-8
 
 
@@ -117,7 +135,7 @@ def test_the_deviation_is_that_of_the_twins(trials: Simulated, fit: OutputErrorF
 def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
     """In a movement of 1 s, where feedback jerk isolation errs by 15 %, from 10 trials a group."""
     assert fit.K.shape == fit.D.shape == (2, 2, 2)
-    assert fit.covariance.shape == (2, 18, 18)
+    assert fit.covariance.shape == (2, 24, 24)
     assert fit.ok.all()
     assert (fit.chi2 > 0.3).all()
     for k, group in enumerate(np.arange(20).reshape(2, 10)):
@@ -134,7 +152,7 @@ def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
 def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -> None:
     alone = fit_of(trials)
     assert alone.K.shape == (2, 2)
-    assert alone.stderr.shape == (18,)
+    assert alone.stderr.shape == (24,)
     assert bool(alone.ok)
     np.testing.assert_allclose(alone.K, fit.K.mean(axis=0), rtol=0.05)
     assert (alone.stderr[4:7] < fit.stderr[:, 4:7]).all()
