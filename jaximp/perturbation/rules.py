@@ -265,6 +265,12 @@ def _of_handle(e: ArmEstimate, limits: TrustLimits) -> str:
     return e.evidence.about_handle if low < e.evidence.disagreement <= high else ""
 
 
+def _biased(e: ArmEstimate, limits: TrustLimits) -> str:
+    """Where another rule comes first."""
+    words = BIASES.get(e.method, ("",))[0]
+    return "" if words in judge(e, limits).in_words() else words
+
+
 def _few_unperturbed(e: ArmEstimate, limits: TrustLimits) -> str:
     if e.misfit is None or e.misfit > MISFIT or e.unperturbed >= ENOUGH:
         return ""
@@ -313,6 +319,7 @@ def _asymmetric(e: ArmEstimate, limits: TrustLimits) -> str:
 WARNINGS: tuple[Callable[[ArmEstimate, TrustLimits], str], ...] = (
     lambda e, limits: window_warning(e.window),
     _of_handle,
+    _biased,
     _few_unperturbed,
     _bends,
     _exact_inertia,

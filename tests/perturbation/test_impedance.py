@@ -26,6 +26,7 @@ from jaximp.perturbation.estimate import ArmEstimate
 from jaximp.perturbation.impedance import ArmImpedance, identify_impedance
 from jaximp.perturbation.isolation.isolated import Impedance, Isolated
 from jaximp.perturbation.isolation.methods import METHODS, Method
+from jaximp.perturbation.rules import BIASES
 from jaximp.perturbation.sensors import handle_disagreement
 from jaximp.perturbation.trials import Handle, Trials
 from jaximp.perturbation.window_lengths import at_other_windows
@@ -534,6 +535,15 @@ def test_warnings_leave_the_verdict(identified: Identify) -> None:
     assert found.verdict == TRUSTED
     for words in ("the window of 200 ms is longer", "without standard errors", "stiffness is not symmetric"):
         assert any(words in warning for warning in found.warnings)
+
+
+def test_a_bias_that_is_known_is_not_believed(identified: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BIASES, "made_up", ("the stiffness has a bias", "use output_error"))
+    found = identified()
+    assert (found.verdict, found.reason, found.warnings) == (POOR, "the stiffness has a bias: use output_error", ())
+    few = identified(trials=4)
+    assert few.verdict == WEAK
+    assert "the stiffness has a bias" in few.warnings
 
 
 def test_a_method_of_its_own_has_no_other_windows(identified: Identify) -> None:

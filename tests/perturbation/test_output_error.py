@@ -148,6 +148,39 @@ def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
         assert (of_D < 0.15 * K.max() / 12).all()
 
 
+def test_a_steep_course_may_bend(trials: Simulated, fit: OutputErrorFit, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a movement of 1 s K11 changes by 70 %, and not evenly: a straight course finds it too small, and too surely."""
+    monkeypatch.setattr(module, "BEND", 1e-9)
+    straight = fit_of(trials, groups=np.arange(20).reshape(2, 10))
+    assert (np.abs(fit.kappa[:, 4]) > 0.5).all()
+    assert (fit.K[:, 0, 0] > straight.K[:, 0, 0]).all()
+    assert (fit.stderr[:, 4] > 1.1 * straight.stderr[:, 4]).all()
+
+
+def test_weights_do_not_hide_the_residuals_that_they_are_made_of() -> None:
+    """From 40 residuals in 20 directions; by weights that know all of them, variances come out at less than half."""
+    random, n, b, T = np.random.default_rng(0), 40, 20, 8
+    S, members = random.normal(size=(T, b, 24)), np.arange(T)
+    known = module._Known(np.zeros(24), 1e-6 * np.eye(24))
+    squares, claimed, careless = [], [], []
+    for _ in range(60):
+        R = random.normal(size=(n, b))
+        r = random.normal(size=(T, b)) + random.normal(size=b) / np.sqrt(n)
+
+        def weighed(unseen: np.ndarray, of: np.ndarray, r: np.ndarray = r) -> Any:
+            return module._Weighed.of(r, S, np.zeros(24), unseen, np.linalg.cholesky(of.T @ of / len(of)))
+
+        out = [np.arange(n) % 10 == k for k in range(10)]
+        folds = tuple(weighed(R[some], R[~some]) for some in out)
+        step = module._Linear(np.zeros(24), r, weighed(R[:0], R), folds).solve(members, known)
+        squares.append(step.theta**2)
+        claimed.append(np.diag(step.covariance))
+        within = module._Linear(np.zeros(24), r, weighed(R[:0], R), (weighed(R, R),)).solve(members, known)
+        careless.append(np.diag(within.covariance) / max(1.0, float(within.chi2)))
+    assert 0.8 < np.mean(claimed) / np.mean(squares) < 1.25
+    assert np.mean(careless) / np.mean(squares) < 0.5
+
+
 @pytest.mark.slow
 def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -> None:
     alone = fit_of(trials)
