@@ -149,7 +149,7 @@ def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
 
 
 def test_a_steep_course_may_bend(trials: Simulated, fit: OutputErrorFit, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a movement of 1 s K11 changes by 70 %, and not evenly: a straight course finds it too small, and too surely."""
+    """In a movement of 1 s K11 changes by 70 %, unevenly: a straight course finds it too small, and too surely."""
     monkeypatch.setattr(module, "BEND", 1e-9)
     straight = fit_of(trials, groups=np.arange(20).reshape(2, 10))
     assert (np.abs(fit.kappa[:, 4]) > 0.5).all()
