@@ -22,8 +22,8 @@ pytest.register_assert_rewrite("factories")
 
 CHOSEN = "JAX_DISABLE_MOST_OPTIMIZATIONS" in os.environ
 STORE = pytest.StashKey[Path]()
-MUCH_MEMORY = 1_500_000_000
-"""Of one process [bytes]: compilers leave it full of holes, which are given back from here on."""
+MUCH_MEMORY, MOST_MEMORY = 1_500_000_000, 2_300_000_000
+"""Of one process [bytes]: compilers leave it full of holes, which are given back from here on, and programs with it."""
 MANY_MAPS = 20_000
 """Pieces of memory of one process. Every compiled program takes some, and at 65 530 Linux gives no more: XLA aborts."""
 
@@ -64,8 +64,9 @@ def little_memory() -> Iterator[None]:
     """A worker compiles for hundreds of tests. Linux only; elsewhere nothing is given back."""
     yield
     memory, maps = Path("/proc/self/statm"), Path("/proc/self/maps")
-    if memory.exists() and int(memory.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MUCH_MEMORY:
-        if maps.read_bytes().count(b"\n") > MANY_MAPS:
+    used = int(memory.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if memory.exists() else 0
+    if used > MUCH_MEMORY:
+        if used > MOST_MEMORY or maps.read_bytes().count(b"\n") > MANY_MAPS:
             jax.clear_caches()
             gc.collect()
         with suppress(AttributeError):  # some C libraries have no such function

@@ -72,6 +72,7 @@ def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "reports/" not in (out / "overview.html").read_text()
 
 
+@pytest.mark.slow
 def test_what_did_not_change_keeps_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Though it is done again with those beside it; and what another run leaves out is told."""
 
@@ -94,6 +95,7 @@ def test_what_did_not_change_keeps_its_report(tmp_path: Path, monkeypatch: pytes
     assert batch.run(parse_job(JOB + "[trust]\nmin_vaf = 0.8\n"), files[:2], out, resume=True).outdated == 1
 
 
+@pytest.mark.slow
 def test_a_report_that_fails_costs_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*args: object) -> None:
         raise RuntimeError("no figure")

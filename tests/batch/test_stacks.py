@@ -79,7 +79,7 @@ CASES = {
 }
 
 
-LONGEST = ("lengths and rates", "robot", "white noise")
+LONGEST = ("lengths and rates", "robot", "white noise", "steps that miss the next window")
 """To compile: they are left to `make test-all`."""
 
 

@@ -146,6 +146,7 @@ def of_robot(one: Estimates) -> list[str]:
     return [note for note in one.notes if note.startswith("the model of the robot lacks")]
 
 
+@pytest.mark.slow
 def test_the_model_of_a_human_in_a_robot_is_tested_by_every_method(ankles: ModuleType) -> None:
     for good, wrong in zip(pair(ankles, 0), pair(ankles, 0, cubic=0.3), strict=True):
         assert len(good.misfits) >= 5

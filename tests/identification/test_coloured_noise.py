@@ -27,7 +27,7 @@ def p_values(ankles: ModuleType, colour: str, noise: str) -> NDArray[np.float64]
     return np.array(found)
 
 
-@pytest.mark.parametrize("colour", ["pink", "AR(1) of 500 ms"])
+@pytest.mark.parametrize("colour", ["pink", pytest.param("AR(1) of 500 ms", marks=pytest.mark.slow)])
 def test_intervals_hold_the_truth_in_coloured_noise(ankles: ModuleType, colour: str) -> None:
     p = p_values(ankles, colour, "estimated")
     for level in (0.5, 0.8, 0.95):

@@ -60,7 +60,7 @@ def presliding(noise: str) -> Estimates:
     return robot_of(recording_from_arrays(TIME, measured, torque), noise)
 
 
-@pytest.mark.parametrize("noise", ["estimated", "filtered"])
+@pytest.mark.parametrize("noise", ["estimated", pytest.param("filtered", marks=pytest.mark.slow)])
 def test_masses_below_zero_in_most_windows_are_not_trusted(noise: str) -> None:
     """Hardly a window is far enough below zero to be refused for itself; all together are."""
     estimates = presliding(noise)

@@ -305,6 +305,7 @@ def movements_of(folder: Path) -> tuple[Trials, Trials | None, tuple[str, ...]]:
     return trials.load()
 
 
+@pytest.mark.slow
 def test_a_handle_that_is_a_little_wrong_is_a_warning(enough: Path) -> None:
     perturbed, unperturbed, _ = movements_of(enough)
     known = KnownArm(GEOMETRY, ARM.inertia, Handle((5.0, 5.0), (19.2, 19.2)))
