@@ -20,7 +20,7 @@ from real_recordings import ANKLE, DATA, REFLEX
 from scipy.signal import butter, cont2discrete, lfilter, sosfiltfilt
 
 from jaximp import parse_job, plots
-from jaximp.identification.identify import Prepared
+from jaximp.identification.prepared import Prepared
 from jaximp.jobs import Job, identify_recording, prepare
 from jaximp.least_squares import confidence_interval, least_squares
 from jaximp.models import pathway_of, reflex_gain

@@ -21,9 +21,10 @@ install_import_hook("jaximp", "shapes.checked")
 pytest.register_assert_rewrite("factories")
 
 CHOSEN = "JAX_DISABLE_MOST_OPTIMIZATIONS" in os.environ
-STORE = pytest.StashKey[Path]()
-MUCH_MEMORY, MOST_MEMORY = 1_500_000_000, 2_300_000_000
-"""Of one process [bytes]: compilers leave it full of holes, which are given back from here on, and programs with it."""
+STORE, KEPT = pytest.StashKey[Path](), pytest.StashKey[int]()
+MUCH_MEMORY, MOST_MEMORY, MORE_MEMORY = 1_500_000_000, 2_300_000_000, 600_000_000
+"""Of one process [bytes]: compilers leave it full of holes, which are given back from here on, and programs with it;
+these again when so much has come on top of what was left."""
 MANY_MAPS = 20_000
 """Pieces of memory of one process. Every compiled program takes some, and at 65 530 Linux gives no more: XLA aborts."""
 
@@ -59,18 +60,27 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         shutil.rmtree(config.stash[STORE], ignore_errors=True)
 
 
+def _memory() -> int:
+    """Of this process [bytes]; 0 where that cannot be told."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
+
+
 @pytest.fixture(autouse=True)
-def little_memory() -> Iterator[None]:
+def little_memory(request: pytest.FixtureRequest) -> Iterator[None]:
     """A worker compiles for hundreds of tests. Linux only; elsewhere nothing is given back."""
     yield
-    memory, maps = Path("/proc/self/statm"), Path("/proc/self/maps")
-    used = int(memory.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if memory.exists() else 0
-    if used > MUCH_MEMORY:
-        if used > MOST_MEMORY or maps.read_bytes().count(b"\n") > MANY_MAPS:
-            jax.clear_caches()
-            gc.collect()
-        with suppress(AttributeError):  # some C libraries have no such function
-            ctypes.CDLL(None).malloc_trim(0)
+    kept = request.config.stash.get(KEPT, MOST_MEMORY - MORE_MEMORY)
+    if (used := _memory()) < MUCH_MEMORY:
+        return
+    full = used > kept + MORE_MEMORY or Path("/proc/self/maps").read_bytes().count(b"\n") > MANY_MAPS
+    if full:
+        jax.clear_caches()
+        gc.collect()
+    with suppress(AttributeError):  # some C libraries have no such function
+        ctypes.CDLL(None).malloc_trim(0)
+    if full:
+        request.config.stash[KEPT] = max(_memory(), MOST_MEMORY - MORE_MEMORY)
 
 
 @pytest.fixture(scope="session")

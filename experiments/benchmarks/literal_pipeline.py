@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from jaximp.identification import FilterSettings, WindowSettings, fit_robot
-from jaximp.identification.identify import noise_of, regress_pair
+from jaximp.identification.prepared import noise_of, regress_pair
 from jaximp.jobs import HumanSettings, ModelSettings, RobotSettings, WindowJob, identify_recording
 from jaximp.least_squares import sliding_theta
 from jaximp.simulation import HumanLoad

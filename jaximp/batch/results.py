@@ -25,7 +25,8 @@ import pyarrow.parquet as pq
 from jaximp.batch.plan import Batch, Item, printable
 from jaximp.batch.tables import recordings_table, windows_table
 from jaximp.batch.task import FAILED, About, Result, Task, checksum, file_checksum, input_checksum, job_checksum, load
-from jaximp.identification.identify import Prepared, in_windows, prepare, share_of_stack, solve_windows
+from jaximp.identification.identify import in_windows, solve_windows
+from jaximp.identification.prepared import Prepared, prepare, share_of_stack
 from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import WindowJob

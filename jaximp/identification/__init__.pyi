@@ -5,13 +5,13 @@ from .estimates import Estimates as Estimates
 from .filter_settings import Filters as Filters
 from .filter_settings import FilterSettings as FilterSettings
 from .filter_settings import design_filters as design_filters
-from .identify import Prepared as Prepared
 from .identify import at_other_lengths as at_other_lengths
 from .identify import estimate as estimate
 from .identify import in_windows as in_windows
-from .identify import prepare as prepare
 from .pipeline import Pipeline as Pipeline
 from .pipeline import WindowSettings as WindowSettings
+from .prepared import Prepared as Prepared
+from .prepared import prepare as prepare
 from .regression import Rows as Rows
 from .separation import Regression as Regression
 from .separation import Separation as Separation

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from jaximp import signals
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.identify import estimate, jump_note
+from jaximp.identification.identify import estimate
+from jaximp.identification.judging import jump_note
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine

@@ -67,6 +67,11 @@ class Placement:
     """(M,) first row of the window that follows without overlap."""
     separate: bool
 
+    @property
+    def given_room(self) -> int | None:
+        """`room`, where other lengths are to share the compiled code."""
+        return self.room if self.lengths else None
+
 
 def place_windows(pipeline: Pipeline, rows: Rows, longest: float | None = None) -> Placement:
     """Find the windows in the rows of a recording.

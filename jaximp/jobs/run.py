@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from jaximp.identification.check import Finding, Proposal, check_recording
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.identify import Prepared, estimate
-from jaximp.identification.identify import prepare as prepare_recording
+from jaximp.identification.identify import estimate
+from jaximp.identification.prepared import Prepared
+from jaximp.identification.prepared import prepare as prepare_recording
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.jobs.run_trials import identify_trials, infer_trials
 from jaximp.perturbation.trials_result import TrialsResult

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import FilterSettings
-from jaximp.identification.identify import estimate, noise_of, regress_pair
+from jaximp.identification.identify import estimate
 from jaximp.identification.pipeline import Pipeline, WindowSettings
+from jaximp.identification.prepared import noise_of, regress_pair
 from jaximp.identification.separation import fit_robot
 from jaximp.least_squares.recursive import recursive_least_squares
 from jaximp.least_squares.window import variance_accounted_for

@@ -16,8 +16,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaximp.identification.identify import Prepared, in_windows, prepare
+from jaximp.identification.identify import in_windows
 from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.prepared import Prepared, prepare
 from jaximp.identification.solving import Placement, place_windows
 from jaximp.least_squares.noise import (
     LAGS,

@@ -24,7 +24,7 @@ from jaximp.batch import run as batch
 from jaximp.batch import tables as batch_tables
 from jaximp.batch import task as batch_task
 from jaximp.batch.plan import find_items
-from jaximp.identification.identify import Prepared
+from jaximp.identification.prepared import Prepared
 from jaximp.jobs.job import parse_job
 from jaximp.recordings.readers import formats
 from jaximp.recordings.save import save_recording

@@ -19,14 +19,8 @@ from jaximp.batch import run as batch
 from jaximp.batch.plan import padded_sizes
 from jaximp.identification import regression
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.identify import (
-    Prepared,
-    _columns_by_joint,
-    in_windows,
-    prepare,
-    share_of_stack,
-    solve_windows,
-)
+from jaximp.identification.identify import in_windows, solve_windows
+from jaximp.identification.prepared import Prepared, columns_by_joint, prepare, share_of_stack
 from jaximp.identification.solving import Solved, place_windows
 from jaximp.identification.whitening import from_white
 from jaximp.jobs.job import Job, parse_job
@@ -100,7 +94,7 @@ def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) 
     prepared = stacked(job, recordings[:1], 1400, 2)[0]
     trusted = in_windows(prepared, curves=False)[0].verdicts.trusted
     assert trusted.any()
-    for joint_columns, found in zip(_columns_by_joint(prepared.model), prepared.solved, strict=True):
+    for joint_columns, found in zip(columns_by_joint(prepared.model), prepared.solved, strict=True):
         rows = prepared.rows if joint_columns is None else prepared.rows.of_joint(*joint_columns)
         place = place_windows(prepared.pipeline, rows)
         given = rows.W, rows.torque
@@ -116,7 +110,7 @@ def test_white_rows_of_a_stack_are_solved_as_one_by_one(case: str) -> None:
     prepared = stacked(parse_job(JOB.replace(old, new) if old else JOB), recordings[:1], 1400, 2)[0]
     trusted = in_windows(prepared, curves=False)[0].verdicts.trusted
     assert trusted.any()
-    for j, (joint_columns, found) in enumerate(zip(_columns_by_joint(prepared.model), prepared.solved, strict=True)):
+    for j, (joint_columns, found) in enumerate(zip(columns_by_joint(prepared.model), prepared.solved, strict=True)):
         rows, white = (
             prepared.rows if joint_columns is None else prepared.rows.of_joint(*joint_columns),
             prepared.white[j],

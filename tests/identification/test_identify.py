@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from factories.joints import JOB, TIME, TRUTH, ankle_job, joint
-from jaximp.identification.identify import in_windows, prepare, with_windows
+from jaximp.identification.identify import in_windows
+from jaximp.identification.prepared import prepare, with_windows
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import confidence_interval

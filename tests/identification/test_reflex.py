@@ -21,7 +21,8 @@ from jaximp.design import motions
 from jaximp.identification import FilterSettings
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import Filters
-from jaximp.identification.identify import in_windows, prepare
+from jaximp.identification.identify import in_windows
+from jaximp.identification.prepared import prepare
 from jaximp.identification.regression import measure, regress, undisturbed
 from jaximp.jobs import parse_job
 from jaximp.jobs.run import identify, identify_recording

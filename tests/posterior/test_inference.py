@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from command_line import jaximp
 from factories.joints import JOB, TIME, TRUTH, joint
-from jaximp.identification.identify import prepare
+from jaximp.identification.prepared import prepare
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import infer_recording
 from jaximp.models import HumanJoint, Joints, Model, ReflexPathway, RobotJoint

@@ -1,0 +1,249 @@
+"""Estimates of the windows of a fit: what is measured of them, what the tests say of the model, what is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximp.identification.comparisons import by_frequency, changes
+from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.misfit import by_bands, harmless, in_words, missing, off_by, sizes, unnoticed
+from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.prepared import Prepared
+from jaximp.identification.regression import Rows
+from jaximp.identification.solving import Placement, Solved
+from jaximp.least_squares.sliding import score
+from jaximp.least_squares.window import SlidingFit
+from jaximp.models.base import Model
+from jaximp.models.reflex import pathway_of
+from jaximp.trust.criteria import fake_change_threshold
+from jaximp.trust.limits import TrustLimits
+from jaximp.trust.score_tests import Bands, Misfit, compare_bands
+from jaximp.trust.window_rules import excited_windows, judge_together, judged_names, measure_windows
+from jaximp.types import Recording
+
+CLEAR = 2.0
+"""A reflex whose gain is so many standard errors from zero has a delay."""
+STILL = 1e-3
+"""A window whose torque varies by a smaller share of the recording's variance can neither confirm nor refute."""
+
+
+def judge(
+    prepared: Prepared,
+    rows: Rows,
+    solved: Solved,
+    place: Placement,
+    method: int | None = None,
+    *notes: str,
+    gain: SlidingFit | None = None,
+    curves: bool = True,
+    misfits: tuple[Misfit, ...] = (),
+) -> Estimates:
+    """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
+    pipeline, model = prepared.pipeline, prepared.model
+    solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
+    fit, starts = solved.fit, place.starts[: len(solved.fit.last)]
+    held_out = _held_out(solved)
+    threshold, why_not = _threshold(prepared, place, method)
+    reflexes = () if gain is None else (_reflex(model, fit, gain),)
+    weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
+    limits = _limits(pipeline, weights)
+    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits))
+    full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
+    measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
+    measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy)
+    measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
+    side_by_side = _apart(place) * np.flatnonzero(excited_windows(measured, limits)[:: _apart(place)])
+    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
+    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown].reshape(reconstructed.shape)
+    about = (jump_note(prepared.recording, prepared.jumps), _literal_note(pipeline), why_not, *of_model.notes, *notes)
+    estimates = Estimates(
+        model=model,
+        names=model.names,
+        units=model.units,
+        window=pipeline.window.length,
+        start=rows.time[starts],
+        end=rows.time[np.asarray(fit.last)],
+        fit=fit,
+        held_out_vaf=held_out,
+        measured=(measured,),
+        limits=pipeline.limits,
+        threshold=threshold,
+        time=rows.time[shown],
+        torque=torque,
+        reconstructed=reconstructed,
+        predicted=predicted,
+        notes=(*prepared.recording.notes, *filter(None, about), *changes(pipeline, fit, side_by_side)),
+        reflexes=reflexes,
+        misfits=misfits,
+        bands=of_model.bands,
+        frequencies=by_frequency(pipeline, rows, prepared.white) if misfits and curves else (),
+        noise=_noise_spectra(prepared, torque - reconstructed) if curves else (),
+        lacking={name: text for name, text in of_model.lacking.items() if name not in weights},
+    )
+    of_reflexes = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
+    return replace(estimates, notes=estimates.notes + of_reflexes) if of_reflexes else estimates
+
+
+def _judged_by_the_human(
+    pipeline: Pipeline, rows: Rows, fit: SlidingFit, place: Placement, method: int | None
+) -> SlidingFit:
+    """Methods 2 and 4 solve for more than the human, and white rows are other rows: the human's torque judges all."""
+    if method is None or not (method in (2, 4) or pipeline.whitens):
+        return fit
+    starts, valid = place.starts[: len(fit.last)], jnp.asarray(rows.valid)
+    seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, place.given_room)
+    quality = (seen.vaf, seen.residual_rms, seen.samples)
+    return eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
+
+
+def _held_out(solved: Solved) -> NDArray[np.float64]:
+    """(M,) how each window predicts the next; NaN where that one hardly has a torque."""
+    unseen = solved.unseen
+    return np.where(np.asarray(unseen.variance) > STILL * solved.moments.torque, np.asarray(unseen.vaf), np.nan)
+
+
+def _limits(pipeline: Pipeline, weights: set[str]) -> TrustLimits:
+    """Weights of neighbouring lags are uncertain one by one, and nobody asks for them one by one."""
+    limits, model = pipeline.limits, pipeline.model
+    if not weights or limits.parameters:
+        return limits
+    kept = [name for name, role in zip(model.names, model.roles, strict=True) if role.kind != "offset"]
+    return replace(limits, parameters=tuple(name for name in kept if name not in weights))
+
+
+def _apart(place: Placement) -> int:
+    """Windows so far from each other share no rows."""
+    if place.separate:
+        return max(1, int(place.next_starts[0] // place.window))
+    return -(-place.window // place.step)
+
+
+def _noise_spectra(prepared: Prepared, left: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Of the noise that was estimated, by what the estimates leave (N, n) of the torque."""
+    if not prepared.white:
+        return ()
+    row_rate = prepared.pipeline.sample_rate / prepared.pipeline.filters.decimate
+    return (prepared.white[0].noise_spectrum(row_rate, left),)
+
+
+@dataclass(frozen=True)
+class _OfModel:
+    """What the tests say of the model."""
+
+    why: str
+    """Why parameters that are judged cannot be trusted."""
+    remedy: str
+    lacking: dict[str, str]
+    """Why each parameter cannot be trusted."""
+    bands: Bands | None
+    notes: tuple[str, str]
+
+    @classmethod
+    def of(
+        cls, model: Model, solved: Solved, misfits: tuple[Misfit, ...], place: Placement, judged: Sequence[str]
+    ) -> _OfModel:
+        theta = np.asarray(solved.fit.theta)
+        size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
+        tests = (misfits, model.names, size, [role.kind for role in model.roles])
+        off, bands = off_by(*tests), None
+        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
+        if solved.ordinary is not None and misfits:
+            apart = _apart(place)
+            bands = compare_bands(np.asarray(solved.ordinary.theta)[::apart], theta[::apart])
+        lacking = by_bands(bands, model.names, model.units)
+        others = [text for name, text in lacking.items() if name in judged and name not in off]
+        lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
+        why = "; ".join(filter(None, [why, *others]))
+        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests)))
+
+
+def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:
+    """Gain and delay in every window, from the weights and from the fit in which the gain is the first of them."""
+    pathway = pathway_of(model)
+    columns = np.array([model.columns.index(column) for column in pathway.columns])
+    theta, lags = np.asarray(fit.theta)[:, columns], np.array(pathway.lags)
+    total, stderr = (np.asarray(x)[:, columns[0]] for x in (gain.theta, gain.stderr))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        delay = np.where(np.abs(total) > CLEAR * stderr, theta @ lags / theta.sum(axis=1), np.nan)
+    return Reflex("reflex", model.units[columns[0]], lags, columns, total, stderr, delay)
+
+
+def _reflex_note(reflex: Reflex, trusted: NDArray[np.bool_]) -> str:
+    note = (
+        "the verdict does not look at the weights of the reflex one by one (trust.parameters can name some): those of "
+        "neighbouring lags are uncertain where their sum, the gain, is not"
+    )
+    below = reflex.gain[trusted] < -CLEAR * reflex.gain_stderr[trusted]
+    if 2 * below.sum() > len(below):
+        note += "; the gain is below zero, as of a reflex that helps the stretch: try the other direction"
+    return note
+
+
+def jump_note(recording: Recording, jumps: NDArray[np.bool_]) -> str:
+    """Where the position jumps, for people; empty where it does not."""
+    at = recording.time[jumps]
+    if not len(at):
+        return ""
+    where = ", ".join(f"{t:.6g} s" for t in at[::2][:5]) + (", ..." if len(at) > 10 else "")
+    return f"the position jumps ({where}), as no joint can move: the samples around that are left out"
+
+
+def _literal_note(pipeline: Pipeline) -> str:
+    if pipeline.once:
+        return ""
+    dropped = pipeline.filter.drop_transient
+    measured = "0.1 (the ends are left out)" if dropped else "2 (filter.drop_transient = true leaves the ends out)"
+    return (
+        "the filters ran inside every window, where position and torque do not pass the same filters near the ends: "
+        f"the inertia is biased, on the simulated rig by {measured} standard deviations; filter.mode = 'once' is not"
+    )
+
+
+def _threshold(prepared: Prepared, place: Placement, method: int | None) -> tuple[float | None, str]:
+    """Threshold of eq. (16), or why it is not applied."""
+    if method in (2, 4):
+        return None, (
+            f"method {method} solves for robot and human together: the threshold for fake changes (eq. 16) of the "
+            "human alone does not fit their condition number and is not applied"
+        )
+    if isinstance(prepared.reference, str):
+        return None, prepared.reference
+    q, dq, ddq = (x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
+    rate = prepared.recording.sample_rate
+    W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))
+    window = round(prepared.pipeline.window.length * rate * place.counted / place.window)
+    return float(fake_change_threshold(np.asarray(W), len(q), window)), ""
+
+
+def _reconstruct(
+    rows: Rows, fit: SlidingFit, starts: NDArray[np.int64], place: Placement, wanted: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """The model's torque with seen and unseen parameters, and which rows it is shown for."""
+    W, theta = np.asarray(rows.W), np.asarray(fit.theta)
+    times, window = rows.time, place.window
+    if not wanted:
+        none = np.empty((0, int(np.prod(W.shape[1:-1]))))
+        return none, none, np.empty(0, np.int64)
+    if place.separate:  # windows hold copies of the same samples: show each sample once, from non-overlapping windows
+        chosen, end = [], -np.inf
+        for k, first in enumerate(starts):
+            if times[first] > end:
+                chosen.append(k)
+                end = times[first + window - 1]
+        shown = np.concatenate([np.arange(starts[k], starts[k] + window) for k in chosen])
+        around = np.repeat(chosen, window)
+        unseen = np.repeat([-1, *chosen[:-1]], window)
+    else:
+        shown = np.arange(len(W))
+        around = np.searchsorted(starts + window / 2, shown).clip(0, len(starts) - 1)
+        unseen = np.searchsorted(starts + window, shown - shown % window, side="right") - 1
+    reconstructed = np.einsum("k...p,kp->k...", W[shown], theta[around])
+    predicted = np.einsum("k...p,kp->k...", W[shown], theta[unseen])
+    predicted[unseen < 0] = np.nan
+    return reconstructed.reshape(len(shown), -1), predicted.reshape(len(shown), -1), shown

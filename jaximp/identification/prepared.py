@@ -1,0 +1,178 @@
+"""A recording behind its filters, with rows whose noise is white: what windows of any length share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from jaximp.identification.literal import noise_in_windows, regress_in_windows
+from jaximp.identification.misfit import RobotTests
+from jaximp.identification.pipeline import Pipeline, ReferenceMotion
+from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
+from jaximp.identification.separation import Regression, Whiten, fit_robot
+from jaximp.identification.solving import MOST_ROWS, Solved
+from jaximp.identification.whitening import White, whiten
+from jaximp.least_squares.window import WindowFit
+from jaximp.models.base import Joints, Model
+from jaximp.types import Recording
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What methods 1 to 4 need beside the rows of the robot with the human."""
+
+    robot: Model
+    robot_fit: WindowFit
+    alone: Regression
+    loaded: Regression
+    tests: RobotTests | None
+    """Of the robot's model, where the pipeline whitens."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A filtered recording: what windows of any length share (but for filters inside every window)."""
+
+    recording: Recording
+    pipeline: Pipeline
+    rows: Rows
+    column_noise: NDArray[np.float64]
+    """(p,) root mean square of what noise of the position leaves in each column."""
+    pair: Pair | None
+    reference: ReferenceMotion
+    jumps: NDArray[np.bool_]
+    """(N,) where the position jumps."""
+    white: tuple[White, ...] = ()
+    """Rows whose noise is white, of each joint (of joints side by side), where the pipeline whitens."""
+    solved: tuple[Solved, ...] = ()
+    """One for each joint (of joints side by side), where the windows of the pipeline are solved already."""
+
+    @property
+    def model(self) -> Model:
+        """What is identified in the windows."""
+        return self.pipeline.model
+
+    @property
+    def noise(self) -> Array | NDArray[np.float64] | None:
+        """What the filters make of white torque noise: by lag in rows, or for every pair of rows of a window."""
+        return noise_of(self.pipeline)
+
+    @property
+    def stackable(self) -> bool:
+        """Whether all its windows are solved in one call, by sums that they share."""
+        return can_be_stacked(self.pipeline) and len(self.rows.time) <= MOST_ROWS
+
+
+def can_be_stacked(pipeline: Pipeline) -> bool:
+    """Whether recordings go through together: a pair needs two at a time, a reflex a second fit for its gain."""
+    return pipeline.once and pipeline.robot is None and not pipeline.model.memory
+
+
+def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
+    """What the filters make of white torque noise: by lag in rows, or for every pair of rows of a window."""
+    if pipeline.once or pipeline.filters.parallel is None:
+        return pipeline.filters.noise
+    return noise_in_windows(pipeline)
+
+
+def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = None) -> Prepared:
+    """Filter a recording, and that of the robot alone where there is a pair."""
+    if pipeline.robot is not None:
+        return _prepare_pair(pipeline, pipeline.robot, recording, alone)
+    pipeline.check(recording)
+    measured = measure(pipeline, recording)
+    if pipeline.once:
+        return _prepared(measured, *regress(measured))
+    return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
+
+
+def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
+    """A recording that was filtered with others, as `prepare` has it.
+
+    **Raises:** `ValueError` where no sample is left.
+    """
+    return _prepared(measured, *rows_of(measured, found, k))
+
+
+def with_windows(prepared: Prepared, pipeline: Pipeline) -> Prepared:
+    """The same rows for windows of another length, whose noise is estimated from what they leave."""
+    white = tuple(whitened(pipeline, prepared.rows)) if prepared.white else ()
+    return replace(prepared, pipeline=pipeline, white=white, solved=())
+
+
+def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:
+    """Rows of the robot's and of the human's model for one recording, apart and stacked."""
+    both = robot + pipeline.model
+    measured = measure(pipeline, recording, both)
+    rows = regress(measured)[0] if pipeline.once else regress_in_windows(pipeline, recording, both)
+    n = len(robot.names)
+    W, torque = jnp.asarray(rows.W), jnp.asarray(rows.torque)
+    return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, measured
+
+
+def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone: Recording | None) -> Prepared:
+    pipeline.check(recording)
+    alone = _checked_pair(recording, alone)
+    # The robot's own parameters come from its whole recording, which needs no windows.
+    whole_record = once(pipeline)
+    whole = regress_pair(whole_record, robot, alone)[0]
+    known = None if pipeline.whitens else noise_of(whole_record)
+    of_rows = whitener(pipeline)
+    white = None if of_rows is None else of_rows(whole.robot, whole.torque, whole.valid)
+    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), white)
+    tests = None if of_rows is None else RobotTests.of(pipeline, alone, whole, of_rows)
+    # Methods 1 and 2 need no windows of the robot alone.
+    shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
+    in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
+    loaded, rows, measured = regress_pair(pipeline, robot, recording)
+    noise = column_noise(measured) if rows.noisy is None else np.sqrt((rows.noisy**2).mean(axis=0))
+    pair = Pair(robot, robot_fit, in_windows, loaded, tests)
+    return _prepared(measured, rows, noise[len(robot.names) :], pair)
+
+
+def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
+    if alone is None:
+        raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
+    if recording.n_joints != 1 or alone.n_joints != 1:
+        raise ValueError("methods 1 to 4 work on one joint at a time: map one position and one torque column")
+    if abs(alone.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+        raise ValueError(
+            f"the robot alone was sampled at {alone.sample_rate:g} Hz and the robot with the human at "
+            f"{recording.sample_rate:g} Hz: resample one of them"
+        )
+    return alone
+
+
+def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: Pair | None = None) -> Prepared:
+    recording, pipeline = measured.recording, measured.pipeline
+    reference = pipeline.reference_motion(recording)
+    white = tuple(whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
+    if white:
+        noise = np.concatenate([one.column_noise for one in white])
+    return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
+
+
+def whitened(pipeline: Pipeline, rows: Rows) -> Iterator[White]:
+    """White rows of each joint of joints side by side, which share neither parameters nor noise."""
+    for columns in columns_by_joint(pipeline.model):
+        yield whiten(pipeline, rows if columns is None else rows.of_joint(*columns))
+
+
+def whitener(pipeline: Pipeline) -> Whiten | None:
+    """What makes white rows of any columns, where the noise's shape is to be estimated."""
+    if not pipeline.whitens:
+        return None
+    return lambda W, y, valid: whiten(pipeline, Rows(W, y, np.asarray(valid), np.empty(0)))
+
+
+def columns_by_joint(model: Model) -> list[tuple[int, slice] | None]:
+    """Which parameters are those of each joint of joints side by side; None stands for all of another model."""
+    if not isinstance(model, Joints):
+        return [None]
+    ends = np.cumsum([len(part.names) for part in model.models]).tolist()
+    return [(j, slice(first, end)) for j, (first, end) in enumerate(zip([0, *ends], ends, strict=False))]
