@@ -137,7 +137,7 @@ def test_a_reflex_is_what_it_is_alone(tmp_path: Path, n_joints: int) -> None:
 def test_a_long_recording_goes_in_chunks_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is too long to be stacked gives what `identify` gives, which solves it in overlapping chunks."""
     monkeypatch.setattr(batch_plan, "LONGEST_STACKED", 1200)
-    monkeypatch.setattr("jaximp.identification.identify.MOST_ROWS", 200)
+    monkeypatch.setattr("jaximp.identification.prepared.MOST_ROWS", 200)
     monkeypatch.setattr(windows, "FROM_CHUNKS", 1)
     save_recording(joint(1321), tmp_path / "long.parquet")
     save_recording(joint(1000), tmp_path / "short.parquet")
