@@ -17,8 +17,8 @@ LONGEST_GLITCH, SIDE = 6, 3
 the signal must be smooth."""
 STANDS_OUT, SMOOTH = 20.0, 6.0
 """A glitch is so many times the noise from its neighbours, and so many times as far as these are from each other."""
-CROWDED, FEWEST_CROWDED = 3.0, 10
-"""So many times the samples of the band below crowd at a limit: a turning point has at most 2.4 times as many there."""
+CROWDED, FEWEST_CROWDED = 2.0, 10
+"""So many times the samples of the band below may crowd at a limit. (They do at a turning point too, up to 2.4 times.)"""
 EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
 MOTION_CUTOFF = 20.0
