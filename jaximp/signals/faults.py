@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.signals.samples import noise_level, quantisation_step
+from jaximp.signals.samples import jumps, noise_level, quantisation_step
 from jaximp.types import Numbers
 
 LONGEST_GLITCH, SIDE = 6, 3
@@ -18,7 +18,7 @@ the signal must be smooth."""
 STANDS_OUT, SMOOTH = 20.0, 6.0
 """A glitch is so many times the noise from its neighbours, and so many times as far as these are from each other."""
 CROWDED, FEWEST_CROWDED = 2.0, 10
-"""So many times the samples of the band below may crowd at a limit. (They do at a turning point too, up to 2.4 times.)"""
+"""So many times the samples of the band below may crowd at a limit. (At a turning point it is up to 2.4 times.)"""
 EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
 MOTION_CUTOFF = 20.0
@@ -101,8 +101,8 @@ def torque_limits(
     """
     level = noise_level(torque) if noise is None else noise
     step = quantisation_step(torque)
-    crowds = [(sign, _crowd(sign * torque, level, step)) for sign in (1, -1)]
-    crowds = [(sign, at) for sign, at in crowds if at is not None]
+    ends = ((sign, _crowd(sign * torque, level, step)) for sign in (1, -1))
+    crowds = [(sign, at) for sign, at in ends if at is not None]
     if not crowds:
         return ()
     free = np.isfinite(torque) & np.isfinite(position) & ~np.any([at for _, at in crowds], axis=0)
@@ -139,10 +139,13 @@ def _crowd(x: Numbers, level: float, step: float) -> NDArray[np.bool_] | None:
 
 
 def _linear_dynamics(position: Numbers, rate: float) -> Numbers:
-    """(N, 5) columns of a smoothed motion, and of friction."""
+    """(N, 5) columns of a smoothed motion that does not jump, and of friction."""
     from scipy.signal import butter, sosfiltfilt
 
-    q = np.interp(np.arange(len(position)), np.flatnonzero(np.isfinite(position)), position[np.isfinite(position)])
+    known = np.isfinite(position)
+    q = np.interp(np.arange(len(position)), np.flatnonzero(known), position[known])
+    leaps = jumps(q)
+    q = np.cumsum(np.where(leaps & np.roll(leaps, 1), 0, np.diff(q, prepend=q[0])))
     q = sosfiltfilt(butter(2, min(MOTION_CUTOFF, rate / 8), fs=rate, output="sos"), q)
     dq = np.gradient(q, 1 / rate)
     ddq = np.gradient(dq, 1 / rate)

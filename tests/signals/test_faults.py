@@ -81,6 +81,10 @@ def test_limits_are_found(limit: float, behind: float, before: float) -> None:
     np.testing.assert_allclose(np.abs([one.value for one in found]), limit * size, rtol=0.05)
 
 
+ON = 5 * np.pi > TIME
+"""For whole periods of three radians a second."""
+
+
 def held_positions() -> Numbers:
     """Steps of half a second between two angles, with a rest at each."""
     phase = np.clip((TIME % 2) / 0.5, 0, 1)
@@ -99,7 +103,7 @@ def held_positions() -> Numbers:
             5 * np.sign(np.sin(3 * TIME + 1e-9)) + noise(0.02, 14),
             id="even acceleration",
         ),
-        pytest.param(np.sin(3 * TIME) * (TIME < 15), np.maximum(np.cos(3 * TIME), 0) * (TIME < 15), id="motor off"),
+        pytest.param(np.sin(3 * TIME) * ON, 20 * (np.sin(3 * TIME) + 1) * ON, id="motor off"),
     ],
 )
 def test_good_torques_have_no_limits(position: Numbers, torque: Numbers) -> None:
