@@ -17,7 +17,7 @@ from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine
 from jaximp.trust.verdicts import NO_DATA, WEAK
 from jaximp.trust.window_rules import POSITIVE_INERTIA
-from jaximp.types import Progress, Recording
+from jaximp.types import Progress, Recording, listed
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
 FEWEST = 100
@@ -26,6 +26,8 @@ SLOWEST = 20.0
 """A joint's impedance cannot be seen below this sample rate [Hz]."""
 WIDEST = 2 * np.pi
 """No human joint turns further than this [rad]."""
+MOST_GLITCHES, MOST_AT_LIMIT = 1e-3, 0.02
+"""Shares of the samples beyond which estimates will be wrong."""
 LONGEST_DELAY = 0.03
 """Delays between torque and position are sought up to this long [s]."""
 
@@ -64,9 +66,11 @@ def check_recording(
         for joint in range(recording.n_joints):
             label = channel if recording.n_joints == 1 else f"{channel} {joint + 1}"
             column = values[:, joint]
-            findings += [_saturation(label, column), _resolution(label, column)]
+            findings += [_glitches(label, column, recording.time), *_held(label, column), _resolution(label, column)]
             if channel == "position":
-                findings += _range(label, recording.joints[joint], column)
+                findings += [_saturation(label, column), *_range(label, recording.joints[joint], column)]
+            else:
+                findings.append(_limits(label, column, recording.position[:, joint], recording.sample_rate))
     progress(0.1)
     bandwidth = coherent_bandwidth(recording)
     position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
@@ -167,6 +171,43 @@ def _gaps(recording: Recording) -> Finding:
     text = [f"{missing:.2%} of the samples are missing" if missing else "none", jump_note(recording, jumped(recording))]
     verdict = BAD if missing > 0.05 else LOOK if missing or text[1] else GOOD
     return Finding("gaps", verdict, "; ".join(filter(None, text)))
+
+
+def _glitches(label: str, x: NDArray[np.float64], time: NDArray[np.float64]) -> Finding:
+    at = signals.glitches(x)
+    if not at.any():
+        return Finding(f"{label}: glitches", GOOD, "none seen")
+    count = f"{at.sum()} samples stand" if at.sum() > 1 else "a sample stands"
+    return Finding(
+        f"{label}: glitches",
+        BAD if at.mean() > MOST_GLITCHES else LOOK,
+        f"{count} out from smooth neighbours by more than {signals.STANDS_OUT:g} times the noise (first at "
+        f"{time[at][0]:.6g} s): write NaN in their place",
+    )
+
+
+def _held(label: str, x: NDArray[np.float64]) -> list[Finding]:
+    count = signals.held_for(x)
+    if count == 1:
+        return []
+    text = (
+        f"changes only every {count} samples, which delays it by {(count - 1) / 2:g} samples on the mean: thin the file"
+    )
+    return [Finding(f"{label}: held samples", BAD, f"{text} to one row of {count}")]
+
+
+def _limits(label: str, torque: NDArray[np.float64], position: NDArray[np.float64], rate: float) -> Finding:
+    found = signals.torque_limits(torque, position, rate)
+    if not found:
+        return Finding(f"{label}: saturation", GOOD, "none seen")
+    share = np.any([one.at for one in found], axis=0).mean()
+    where = listed([f"{one.value:.4g}" for one in found])
+    return Finding(
+        f"{label}: saturation",
+        BAD if share > MOST_AT_LIMIT else LOOK,
+        f"{share:.1%} of the samples lie at a limit ({where} N m) where the motion asks for more: estimates come out "
+        "too small; use a larger range, or write NaN in their place",
+    )
 
 
 def _saturation(label: str, x: NDArray[np.float64]) -> Finding:

@@ -1,4 +1,4 @@
-"""Filters without a shift in time, derivatives, and what raw samples are like: noise, jumps, steps."""
+"""Filters without a shift in time, derivatives, and raw samples: noise, jumps, steps, glitches, limits."""
 
 import lazy_loader
 

@@ -8,6 +8,11 @@ from .derivatives import differentiate_padded as differentiate_padded
 from .derivatives import savitzky_golay as savitzky_golay
 from .derivatives import savitzky_golay_gain as savitzky_golay_gain
 from .derivatives import savitzky_golay_half_length as savitzky_golay_half_length
+from .faults import STANDS_OUT as STANDS_OUT
+from .faults import Limit as Limit
+from .faults import glitches as glitches
+from .faults import held_for as held_for
+from .faults import torque_limits as torque_limits
 from .filters import CutSignal as CutSignal
 from .filters import PaddedFilter as PaddedFilter
 from .filters import Sections as Sections
