@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+MOST_EVENTS, BETWEEN = 10_000, 0.02
+"""Messages before an answer, and seconds from one look at the page to the next."""
 # The browser reads commands from file 3 and answers on file 4; neither may be overwritten while the other moves there.
 START = "import os,sys;r,w=map(int,sys.argv[1:3]);r,w=os.dup(r),os.dup(w);os.dup2(r,20);os.dup2(w,21);\
 os.dup2(20,3);os.dup2(21,4);os.execv(sys.argv[3],sys.argv[3:])"
@@ -51,18 +53,21 @@ class Browser:
         if session is not None:
             message["sessionId"] = session
         os.write(self._commands, json.dumps(message).encode() + b"\0")
-        end = time.monotonic() + self.limit
-        while (answer := self._next(end)).get("id") != self._count:
+        for _ in range(MOST_EVENTS):
+            if (answer := self._next()).get("id") == self._count:
+                break
             self.events.append(answer)
+        else:
+            raise TimeoutError(f"{method}: no answer among {MOST_EVENTS} messages of the browser")
         if "error" in answer:
             raise RuntimeError(f"{method}: {answer['error']}")
         result: dict[str, Any] = answer["result"]
         return result
 
-    def _next(self, end: float) -> dict[str, Any]:
+    def _next(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
-            if not select.select([self._answers], [], [], max(0.0, end - time.monotonic()))[0]:
-                raise TimeoutError(f"the browser did not answer within {self.limit:g} s")
+            if not select.select([self._answers], [], [], self.limit)[0]:
+                raise TimeoutError(f"the browser was silent for {self.limit:g} s")
             more = os.read(self._answers, 1 << 20)
             if not more:
                 raise RuntimeError("the browser ended")
@@ -88,11 +93,11 @@ class Browser:
 
     def wait(self, condition: str) -> None:
         """Until an expression holds."""
-        end = time.monotonic() + self.limit
-        while not self.evaluate(f"Boolean({condition})"):
-            if time.monotonic() > end:
-                raise TimeoutError(f"{condition} did not come true within {self.limit:g} s")
-            time.sleep(0.02)
+        for _ in range(round(self.limit / BETWEEN)):
+            if self.evaluate(f"Boolean({condition})"):
+                return
+            time.sleep(BETWEEN)
+        raise TimeoutError(f"{condition} did not come true within {self.limit:g} s")
 
     def frame(self) -> None:
         """Wait until the page has been drawn with all changes so far."""

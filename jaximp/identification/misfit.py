@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ def find_misfits(
     if recording.n_joints > 1:
         tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
         if not has_muscles(pipeline.model) and len(tests.torque) < FEWEST_WINDOWS * tests.window:
-            tests = replace(tests, window=len(tests.torque), fit=None)
+            tests = tests.with_other(window=len(tests.torque))
         return tuple(_as_delayed(_one_after_another(tests)))
     groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
     return _of_joint(pipeline, Tests.of(pipeline, white, rows.valid, groups)(), theta)
@@ -78,7 +79,7 @@ class RobotTests:
         columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
         white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
         tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
-        tests = replace(tests, W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque), fit=None)
+        tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque))
         lacking, W = _suspected(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
@@ -148,6 +149,10 @@ class Tests:
         """Test every group."""
         return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every, self.fit)
 
+    def with_other(self, **rows: Any) -> Tests:
+        """With other rows or windows, whose fit is not known yet."""
+        return replace(self, fit=None, **rows)
+
     def without(self, found: Sequence[Misfit]) -> Tests:
         """Of the groups of other joints, with all that these groups of one joint explain taken off the torque."""
         joint = untagged(found[0].group)[1]
@@ -159,7 +164,7 @@ class Tests:
         }
         columns = np.concatenate([self.groups[name] for name in sorted(gone)], axis=1)
         (together,) = replace(self, groups={"together": columns})()
-        return replace(self, torque=self.torque - columns @ together.weights, groups=others, fit=None)
+        return self.with_other(torque=self.torque - columns @ together.weights, groups=others)
 
 
 def _one_after_another(tests: Tests) -> list[Misfit]:
