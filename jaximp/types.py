@@ -24,6 +24,20 @@ Progress = Callable[[float], None]
 """Called with the finished share of a long computation, from 0 to 1."""
 
 
+@dataclass(frozen=True)
+class Fault:
+    """What a sensor or a recorder did to the raw samples of one column."""
+
+    label: str
+    """Of the column: `position`, or `torque 2` of several joints."""
+    kind: str
+    """`glitches`, `held samples` or `saturation`."""
+    share: float
+    """Of the samples."""
+    text: str
+    """What was seen and what was done about it, in words that begin with the label."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One measured motion on a uniform time grid, in SI units.
@@ -52,9 +66,16 @@ class Recording:
     """(N, n) position that the controller was asked to follow."""
     command: NDArray[np.float64] | None = None
     """(N, n) perturbing torque (or force) that was commanded, zero before and after the perturbation."""
+    position_noise: NDArray[np.float64] | None = None
+    """(n,) standard deviation of the white noise of each position, as it was seen before anything was resampled, or as
+    it was stated; None where nobody has looked."""
+    clipped: NDArray[np.bool_] | None = None
+    """(N,) True where a torque was cut off at a limit; these samples are not valid."""
     name: str = "recording"
     notes: tuple[str, ...] = ()
     """What reading the file changed or noticed, in plain words."""
+    faults: tuple[Fault, ...] = ()
+    """What was wrong with the raw samples; the notes say it too."""
 
     @property
     def sample_rate(self) -> float:

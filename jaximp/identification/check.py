@@ -15,9 +15,10 @@ from jaximp.identification.judging import jump_note
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import jumped, measure, regress
 from jaximp.models.base import combine
+from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import NO_DATA, WEAK
 from jaximp.trust.window_rules import POSITIVE_INERTIA
-from jaximp.types import Progress, Recording, listed
+from jaximp.types import Progress, Recording
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
 FEWEST = 100
@@ -26,8 +27,8 @@ SLOWEST = 20.0
 """A joint's impedance cannot be seen below this sample rate [Hz]."""
 WIDEST = 2 * np.pi
 """No human joint turns further than this [rad]."""
-MOST_GLITCHES, MOST_AT_LIMIT = 1e-3, 0.02
-"""Shares of the samples beyond which estimates will be wrong."""
+MOST_GLITCHES = 1e-3
+"""A share of the samples beyond which the recorder should be looked at."""
 LONGEST_DELAY = 0.03
 """Delays between torque and position are sought up to this long [s]."""
 
@@ -66,11 +67,9 @@ def check_recording(
         for joint in range(recording.n_joints):
             label = channel if recording.n_joints == 1 else f"{channel} {joint + 1}"
             column = values[:, joint]
-            findings += [_glitches(label, column, recording.time), *_held(label, column), _resolution(label, column)]
+            findings += [*_faults(recording, label, pipeline.limits), _resolution(label, column)]
             if channel == "position":
                 findings += [_saturation(label, column), *_range(label, recording.joints[joint], column)]
-            else:
-                findings.append(_limits(label, column, recording.position[:, joint], recording.sample_rate))
     progress(0.1)
     bandwidth = coherent_bandwidth(recording)
     position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
@@ -155,7 +154,9 @@ def _sampling(recording: Recording) -> Finding:
     text = f"{len(recording)} samples at {recording.sample_rate:.6g} Hz, {len(recording) / recording.sample_rate:.4g} s"
     if recording.sample_rate < SLOWEST:
         return Finding("sampling", BAD, f"{text}: too slow for a joint; is the time's unit right (ms?)")
-    return Finding("sampling", LOOK if recording.notes else GOOD, "; ".join([text, *recording.notes]))
+    said = {fault.text for fault in recording.faults}
+    notes = [note for note in recording.notes if note not in said]
+    return Finding("sampling", LOOK if notes else GOOD, "; ".join([text, *notes]))
 
 
 def _range(label: str, joint: str, x: NDArray[np.float64]) -> list[Finding]:
@@ -173,41 +174,20 @@ def _gaps(recording: Recording) -> Finding:
     return Finding("gaps", verdict, "; ".join(filter(None, text)))
 
 
-def _glitches(label: str, x: NDArray[np.float64], time: NDArray[np.float64]) -> Finding:
-    at = signals.glitches(x)
-    if not at.any():
-        return Finding(f"{label}: glitches", GOOD, "none seen")
-    count = f"{at.sum()} samples stand" if at.sum() > 1 else "a sample stands"
-    return Finding(
-        f"{label}: glitches",
-        BAD if at.mean() > MOST_GLITCHES else LOOK,
-        f"{count} out from smooth neighbours by more than {signals.STANDS_OUT:g} times the noise (first at "
-        f"{time[at][0]:.6g} s): write NaN in their place",
-    )
-
-
-def _held(label: str, x: NDArray[np.float64]) -> list[Finding]:
-    count = signals.held_for(x)
-    if count == 1:
-        return []
-    text = (
-        f"changes only every {count} samples, which delays it by {(count - 1) / 2:g} samples on the mean: thin the file"
-    )
-    return [Finding(f"{label}: held samples", BAD, f"{text} to one row of {count}")]
-
-
-def _limits(label: str, torque: NDArray[np.float64], position: NDArray[np.float64], rate: float) -> Finding:
-    found = signals.torque_limits(torque, position, rate)
-    if not found:
-        return Finding(f"{label}: saturation", GOOD, "none seen")
-    share = np.any([one.at for one in found], axis=0).mean()
-    where = listed([f"{one.value:.4g}" for one in found])
-    return Finding(
-        f"{label}: saturation",
-        BAD if share > MOST_AT_LIMIT else LOOK,
-        f"{share:.1%} of the samples lie at a limit ({where} N m) where the motion asks for more: estimates come out "
-        "too small; use a larger range, or write NaN in their place",
-    )
+def _faults(recording: Recording, label: str, limits: TrustLimits) -> list[Finding]:
+    """What was masked of the raw samples of a column, in the words of the recording's notes."""
+    found = {one.kind: one for one in recording.faults if one.label == label}
+    kinds = ["glitches", "held samples", *(["saturation"] if label.startswith("torque") else [])]
+    findings = []
+    for kind in kinds:
+        if kind in found:
+            most = limits.max_at_limit if kind == "saturation" else MOST_GLITCHES
+            bad = kind != "held samples" and found[kind].share > most
+            text = found[kind].text.removeprefix(f"{label}: ")
+            findings.append(Finding(f"{label}: {kind}", BAD if bad else LOOK, text))
+        elif kind != "held samples":
+            findings.append(Finding(f"{label}: {kind}", GOOD, "none seen"))
+    return findings
 
 
 def _saturation(label: str, x: NDArray[np.float64]) -> Finding:
@@ -245,7 +225,9 @@ def _cutoffs(bandwidth: float, recording: Recording) -> tuple[float, float]:
 
 
 def _delay(pipeline: Pipeline, recording: Recording) -> Finding:
-    delay, determined = estimate_delay(pipeline, recording)
+    delay, determined = 0.0, False
+    with suppress(ValueError):  # which says why no window can be tried either
+        delay, determined = estimate_delay(pipeline, recording)
     if not determined:
         return Finding("delay", GOOD, "the data do not determine a delay between torque and position")
     text = f"the model fits best if torque lags position by {1e3 * delay:.2f} ms"

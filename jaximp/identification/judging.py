@@ -20,12 +20,14 @@ from jaximp.identification.solving import Placement, Solved
 from jaximp.least_squares.sliding import score
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
+from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
+from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands
-from jaximp.trust.window_rules import excited_windows, judge_together, judged_names, measure_windows
-from jaximp.types import Recording
+from jaximp.trust.window_rules import Windows, excited_windows, judge_together, judged_names, measure_windows
+from jaximp.types import Numbers, Recording
 
 CLEAR = 2.0
 """A reflex whose gain is so many standard errors from zero has a delay."""
@@ -56,12 +58,21 @@ def judge(
     of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits))
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
-    measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy)
+    at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
+    measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy, at_limit=at_limit)
+    measured = _against_other_people(measured, model, fit, limits)
     measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
     side_by_side = _apart(place) * np.flatnonzero(excited_windows(measured, limits)[:: _apart(place)])
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
     torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown].reshape(reconstructed.shape)
-    about = (jump_note(prepared.recording, prepared.jumps), _literal_note(pipeline), why_not, *of_model.notes, *notes)
+    about = (
+        jump_note(prepared.recording, prepared.jumps),
+        _literal_note(pipeline),
+        why_not,
+        _likeness(measured, limits),
+        *of_model.notes,
+        *notes,
+    )
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -106,6 +117,34 @@ def _held_out(solved: Solved) -> NDArray[np.float64]:
     """(M,) how each window predicts the next; NaN where that one hardly has a torque."""
     unseen = solved.unseen
     return np.where(np.asarray(unseen.variance) > STILL * solved.moments.torque, np.asarray(unseen.vaf), np.nan)
+
+
+def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limits: TrustLimits) -> Windows:
+    """With what a human joint can have; nothing is known of anything else."""
+    ranges = plausibility.ranges_of(limits.one_joint_name)
+    if ranges is None or not isinstance(model, HumanJoint) or model.units[2] != plausibility.UNITS[2]:
+        return measured
+    which = [model.names.index(name) for name in plausibility.PARAMETERS]
+    factor = np.asarray(model.at_joint(np.ones(len(model.names))))[which]
+    theta, stderr = (np.asarray(x)[:, which] * factor for x in (fit.theta, fit.stderr))
+    outside = plausibility.times_outside(theta, stderr, ranges, limits.errors_apart)
+    return replace(measured, impedance=theta, outside=outside)
+
+
+def _likeness(measured: Windows, limits: TrustLimits) -> str:
+    """Which joints it could be, where nobody said."""
+    if limits.joint_name is not None or measured.impedance is None or not measured.determined.any():
+        return ""
+    return plausibility.likeness(np.median(measured.impedance[measured.determined], axis=0))
+
+
+def _share_at_limit(recording: Recording, start: Numbers, end: Numbers) -> Numbers | float:
+    """(M,) of the samples of windows from `start` to `end` (M,) [s]."""
+    if recording.clipped is None:
+        return 0.0
+    before = np.cumsum(np.r_[0, recording.clipped])
+    first, last = np.searchsorted(recording.time, start), np.searchsorted(recording.time, end, side="right")
+    return np.asarray((before[last] - before[first]) / np.maximum(last - first, 1))
 
 
 def _limits(pipeline: Pipeline, weights: set[str]) -> TrustLimits:

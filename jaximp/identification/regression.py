@@ -32,7 +32,7 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled
 from jaximp.numerics.precision import require_float64
-from jaximp.types import AnyArray, Recording
+from jaximp.types import AnyArray, Numbers, Recording
 
 T = TypeVar("T")
 
@@ -103,11 +103,12 @@ def measure(pipeline: Pipeline, recording: Recording, model: Model | None = None
         if sos is not None:
             signals.check_long_enough(sos, len(recording))
     motion = measured_motion(pipeline.filter, recording)
-    levels = [signals.noise_level(q) for q in motion.position.T]
-    known = levels if motion.position is recording.position else [None] * len(levels)
-    jumps = np.any([signals.jumps(q, level) for q, level in zip(recording.position.T, known, strict=True)], axis=0)
+    levels = recording.position_noise
+    if levels is None:
+        levels = np.array([signals.noise_level(q) for q in motion.position.T])
+    jumps = jumped(recording, levels)
     clean = undisturbed(recording, filters, memory=model.memory, jumps=jumps)
-    return Measured(recording, pipeline, model, motion, with_noise(motion, levels), jumps, clean)
+    return Measured(recording, pipeline, model, motion, with_noise(motion, levels.tolist()), jumps, clean)
 
 
 def regress(measured: Measured) -> tuple[Rows, NDArray[np.float64]]:
@@ -162,9 +163,10 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
     clean, moving = measured.clean[::decimate], speed >= pipeline.window.min_velocity
     valid = clean & moving if recording.n_joints == 1 else clean[:, None] & moving
     if not valid.any():
+        cut = "" if recording.clipped is None else f", {recording.clipped.mean():.0%} lie at a limit of the torque"
         raise ValueError(
-            f"no sample is left after filtering ({np.mean(~recording.valid):.0%} were not measured): the recording is "
-            "too short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
+            f"no sample is left after filtering ({np.mean(~recording.valid):.0%} cannot be used{cut}): the recording "
+            "is too short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
             "window.min_velocity"
         )
     noisy, level = _noise_of(measured, found, k)
@@ -308,9 +310,11 @@ def first_call(*program: Any) -> Iterator[None]:
 # --- what can be seen on the host -------------------------------------------------------------------------------------
 
 
-def jumped(recording: Recording) -> NDArray[np.bool_]:
-    """(N,) True where the position of some joint jumps."""
-    return np.any([signals.jumps(q) for q in recording.position.T], axis=0)
+def jumped(recording: Recording, noise: Numbers | None = None) -> NDArray[np.bool_]:
+    """(N,) True where the position of some joint jumps; `noise` (n,) of each position, where it is known."""
+    levels = recording.position_noise if noise is None else noise
+    known = [None] * recording.n_joints if levels is None else levels.tolist()
+    return np.any([signals.jumps(q, level) for q, level in zip(recording.position.T, known, strict=True)], axis=0)
 
 
 def undisturbed(
@@ -322,11 +326,13 @@ def undisturbed(
 ) -> NDArray[np.bool_]:
     """(N,) samples whose filtered value comes from measurements, and not from a gap, a jump or (`ends`) an end.
 
-    A gap that is short against the filters is bridged: the straight line across it is as good as a measurement. What a
-    gap, a jump or the beginning spoils, a model with a `memory` of so many samples remembers. `jumps` is what `jumped`
-    finds, where that is known.
+    A gap that is short against the filters is bridged: the straight line across it is as good as a measurement, but
+    where the torque was cut off at a limit. What a gap, a jump or the beginning spoils, a model with a `memory` of so
+    many samples remembers. `jumps` is what `jumped` finds, where that is known.
     """
     missing = signals.long_gaps(recording.valid, filters.bridge)
+    if recording.clipped is not None:
+        missing |= recording.clipped
     known = signals.lengthen_gaps(~missing, memory)
     known[: memory if ends else 0] = False
     valid = signals.widen_gaps(known, filters.reach, ends)

@@ -27,6 +27,7 @@ from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping
+from jaximp.trust import plausibility
 from jaximp.trust.limits import TrustLimits
 from jaximp.types import Recording
 
@@ -85,6 +86,8 @@ class HumanSettings:
     """A column of the offset torque, which is minus the stiffness times the equilibrium angle."""
     gear_ratio: float = 1.0
     """Motor turns per joint turn, where position and torque stay on the motor's side."""
+    joint_name: str | list[str] | None = None
+    """Which joint it is, as `trust.joint_name`."""
     reflex: bool | ReflexSettings = False
     """The stretch reflex: `true`, or a table with some of its settings."""
 
@@ -163,6 +166,7 @@ class WindowJob:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
         one model of two joints, stands in the robot's place. A human with a reflex needs the `sample_rate` [Hz]."""
         robot, human = self.model.robot, self.model.human
+        human = None if human is None else replace(human, joint_name=None)
         if self.model.arm is not None:
             if joints != ("revolute", "revolute"):
                 raise ValueError(
@@ -183,11 +187,19 @@ class WindowJob:
             model=model,
             window=self.window,
             filter=self.filter,
-            limits=self.trust,
+            limits=self._limits(len(joints)),
             robot=None if human is None else robot,
             methods=self.model.methods,
             reference=self.load_design() or self.reference_period,
         )
+
+    def _limits(self, joints: int) -> TrustLimits:
+        """With the names of the joints, wherever they stand."""
+        human = None if self.model.human is None else self.model.human.joint_name
+        name = human if self.trust.joint_name is None else self.trust.joint_name
+        if isinstance(name, list) and len(name) != joints:
+            raise ValueError(f"joint_name lists {len(name)} joints, but the recording has {joints}: give one for each")
+        return replace(self.trust, joint_name=name)
 
     def pipeline_for(self, recording: Recording) -> Pipeline:
         """What is done with this recording."""
@@ -339,6 +351,9 @@ def _check_values(job: WindowJob) -> None:
     if not both and job.robot_recording is not None:
         raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
     if job.model.human is not None:
+        for names in (job.model.human.joint_name, job.trust.joint_name):
+            for name in names if isinstance(names, list) else [names]:
+                plausibility.ranges_of(name)
         job.model.human.make(1000.0)  # refuses lags that make no sense
         if job.model.human.reflex and job.filter.mode == "window":
             raise ValueError("filter.mode = 'window' cuts off the past that a reflex answers to: set it to 'once'")

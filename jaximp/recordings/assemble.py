@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jaximp.recordings.channels import Signal, check_lengths
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import check_stamps, on_uniform_grid
+from jaximp.recordings.raw import judge_raw
 from jaximp.types import Recording
 
 
@@ -23,13 +24,18 @@ def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...],
     valid, notes = _complete_rows(labels, samples)
     for channel in ("position", "torque"):
         notes += _check_motion(channel, signals[channel], valid)
-    time, samples, valid, sampling_notes = on_uniform_grid(stamps, samples, valid)
+    judged = judge_raw(stamps, signals, valid)
+    samples = np.hstack([signal.values for signal in judged.signals.values()])
+    time, samples, valid, sampling_notes = on_uniform_grid(stamps, samples, judged.valid)
     _check_enough(valid)
-    samples[~valid] = np.nan
+    samples = np.where(valid[:, None], samples, np.nan)
     borders = np.cumsum([len(signal.labels) for signal in signals.values()])[:-1]
-    channels = dict(zip(signals, np.split(samples, borders, axis=1), strict=True))
-    arrays = {key: _frozen(array) for key, array in (channels | {"time": time, "valid": valid}).items()}
-    return Recording(**arrays, joints=joints, name=name, notes=(*sampling_notes, *notes))
+    channels: dict[str, NDArray[Any]] = dict(zip(signals, np.split(samples, borders, axis=1), strict=True))
+    clipped = np.interp(time, stamps, judged.clipped) > 0.5 if judged.clipped.any() else None
+    whole = {"time": time, "valid": valid, "position_noise": judged.position_noise, "clipped": clipped}
+    arrays = {key: _frozen(array) for key, array in (channels | whole).items() if array is not None}
+    faults = tuple(fault.text for fault in judged.faults)
+    return Recording(**arrays, joints=joints, name=name, notes=(*sampling_notes, *notes, *faults), faults=judged.faults)
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

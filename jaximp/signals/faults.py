@@ -3,6 +3,7 @@ as they were measured, before anything is interpolated or filtered."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,12 +16,20 @@ from jaximp.types import Numbers
 LONGEST_GLITCH, SIDE = 6, 3
 """Samples from the first to the last of a glitch (of more than three those between may be good), and how far beside it
 the signal must be smooth."""
+AROUND = 25
+"""Samples on either side by whose roughness a glitch is judged."""
 STANDS_OUT, SMOOTH = 20.0, 6.0
 """A glitch is so many times the noise from its neighbours, and so many times as far as these are from each other."""
 CROWDED, FEWEST_CROWDED = 2.0, 10
 """So many times the samples of the band below may crowd at a limit. (At a turning point it is up to 2.4 times.)"""
+BEYOND = 0.5
+"""So far beyond a limit dynamics ask for, as a share of the scatter of what they leave of other samples."""
+FEWEST_VISITS, QUIET = 5, 0.3
+"""To a limit that cuts off the noise as well: neighbours there differ by less than this share of the noise."""
 EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
+FEWEST_UPDATES, LONGEST_HELD = 20, 64
+"""Of a signal that is held between its samples, and for how many samples."""
 MOTION_CUTOFF = 20.0
 """Of the motion that the torque at a limit is predicted from [Hz]."""
 
@@ -30,7 +39,8 @@ def glitches(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
 
     A transmission error, a sentinel such as -999, a lost value written as 0. Both ends of a glitch are far from the
     cubic through two good samples on either side, farther than that cubic is from a straight line and than samples
-    beside it are from cubics of their own. `noise` is the `noise_level`, where it is known.
+    beside it are from cubics of their own, and outside of what lies between its neighbours. `noise` is the
+    `noise_level`, where it is known.
     """
     known = np.flatnonzero(np.isfinite(x))
     z, out = x[known], np.zeros(len(x), bool)
@@ -42,25 +52,43 @@ def glitches(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
     rough[2:-2] = np.abs(z[2:-2] - (4 * (z[1:-3] + z[3:-1]) - z[:-4] - z[4:]) / 6)
     suspected = np.flatnonzero(rough > STANDS_OUT * max(level, np.finfo(float).tiny))
     found = np.zeros(len(z), bool)
+    usual = _usual_around(rough, level)
     for m in range(1, LONGEST_GLITCH + 1):
         first = suspected[(suspected >= margin) & (suspected < len(z) - m - margin)]
         run = first[:, None] + np.arange(m)
+        ends, beside = z[run[:, [0, -1]]], z[first[:, None] + np.array([-1, m])]
         off, bend = _from_cubic(z, first, m)
+        nearest = off[:, [0, -1]].min(axis=1)
         # Between two levels every sample lies on one of them.
-        levels = np.abs(z[run[:, [0, -1]], None] - z[first[:, None, None] + np.array([-1, m])]).min(axis=(1, 2))
-        beside = rough[first[:, None] + np.r_[-3 - np.arange(SIDE), m + 2 + np.arange(SIDE)]].max(axis=1)
-        ends = np.minimum(off[:, 0], off[:, -1])
+        from_levels = np.abs(ends[:, :, None] - beside[:, None]).min(axis=(1, 2))
+        # What lies between its neighbours may have been sampled late, and does no harm.
+        low, high = beside.min(axis=1, keepdims=True), beside.max(axis=1, keepdims=True)
+        outside = np.maximum(low - ends, ends - high).min(axis=1)
+        rest = rough[first[:, None] + np.r_[-3 - np.arange(SIDE), m + 2 + np.arange(SIDE)]].max(axis=1)
         wrong = (
-            (ends > STANDS_OUT * level)
-            & (ends > SMOOTH * np.maximum(bend, beside))
-            & (levels > 0.5 * ends)
+            (known[first + m + 1] - known[first - 2] == m + 3)
+            & (np.minimum(outside, nearest) > STANDS_OUT * usual(first))
+            & (nearest > SMOOTH * np.maximum(bend, rest))
+            & (from_levels > 0.5 * nearest)
             & ~found[run].any(axis=1)
         )
         if m > 3:
-            wrong &= off[:, 1:-1].max(axis=1) < 0.3 * ends
+            wrong &= off[:, 1:-1].max(axis=1) < 0.3 * nearest
         found[run[wrong]] = True
     out[known[found]] = True
     return out
+
+
+def _usual_around(rough: Numbers, level: float) -> Callable[[NDArray[np.int64]], Numbers]:
+    """What tells how rough a signal is around samples (K,), before them or after them, whichever is more: a motor may
+    rest for most of a record."""
+
+    def usual(first: NDArray[np.int64]) -> Numbers:
+        away = SIDE + LONGEST_GLITCH + np.arange(AROUND)
+        before, after = (rough[(first[:, None] + side * away).clip(0, len(rough) - 1)] for side in (-1, 1))
+        return np.maximum(level, np.maximum(np.median(before, axis=1), np.median(after, axis=1)))
+
+    return usual
 
 
 def _from_cubic(z: Numbers, first: NDArray[np.int64], m: int) -> tuple[Numbers, Numbers]:
@@ -93,11 +121,12 @@ class Limit(NamedTuple):
 def torque_limits(
     torque: Numbers, position: Numbers, sample_rate: float, noise: float | None = None
 ) -> tuple[Limit, ...]:
-    """Limits at which a torque (N,) was cut off while the joint at `position` (N,) would have asked for more.
+    """Limits at which a torque (N,) was cut off while the joints at `position` (N,) or (N, n) asked for more.
 
-    Samples crowd at the end of a range that is cut off, also where noise was added behind the limit; so they do where a
-    joint is held, or accelerates evenly. The torque that linear dynamics, found from all other samples, predicts for
-    them tells: beyond the limit it was cut off.
+    Samples crowd at the end of a range that is cut off; so they do where a joint is held, or accelerates evenly. Either
+    of two things tells the difference. The noise of the torque is cut off with it, so that samples at the limit hardly
+    differ from their neighbours there. Or, where noise was added behind the limit, the torque that linear dynamics,
+    found from all other samples, predicts for them lies beyond the limit.
     """
     level = noise_level(torque) if noise is None else noise
     step = quantisation_step(torque)
@@ -105,61 +134,117 @@ def torque_limits(
     crowds = [(sign, at) for sign, at in ends if at is not None]
     if not crowds:
         return ()
-    free = np.isfinite(torque) & np.isfinite(position) & ~np.any([at for _, at in crowds], axis=0)
-    columns = _linear_dynamics(position, sample_rate)
-    if free.sum() < 4 * columns.shape[1]:
-        return ()
-    theta = np.linalg.lstsq(columns[free], torque[free])[0]
-    left, found = torque - columns @ theta, []
-    scatter = left[free].std()
+    free = np.isfinite(torque) & ~np.any([at for _, at in crowds], axis=0)
+    left = _beside_dynamics(torque, position.reshape(len(torque), -1), free, sample_rate)
+    found = []
     for sign, at in crowds:
-        beyond = -sign * left[at & np.isfinite(left)]
-        if np.mean(beyond > 0) > 0.6 and beyond.mean() > 0.5 * scatter:
+        visits = int((np.diff(np.r_[False, at].astype(np.int8)) > 0).sum())
+        # Of smooth peaks that a nonlinear joint makes there are few.
+        often = visits >= FEWEST_VISITS
+        asked = (often or np.ptp(torque[at]) == 0) and _asked_beyond(-sign * left, at, free)
+        if asked or (often and _without_noise(torque, at, free, step)):
             found.append(Limit(float(np.median(torque[at])), at))
     return tuple(found)
 
 
+def _without_noise(x: Numbers, at: NDArray[np.bool_], free: NDArray[np.bool_], step: float) -> bool:
+    """Whether neighbours at a limit are nearer to each other than noise lets others be."""
+    pairs = at[1:] & at[:-1]
+    if pairs.sum() < FEWEST_CROWDED:
+        return False
+    usual = noise_level(np.where(free, x, np.nan))
+    return bool(usual > 2 * step and np.median(np.abs(np.diff(x)[pairs])) < QUIET * usual)
+
+
+def _asked_beyond(left: Numbers, at: NDArray[np.bool_], free: NDArray[np.bool_]) -> bool:
+    """Whether the dynamics ask for more than a limit lets through (N,)."""
+    # Where no limit is, noise lifts the samples at the end of the range above what is predicted.
+    beyond = left[at & np.isfinite(left)]
+    scatter = np.nanstd(left[free]) if np.isfinite(left[free]).any() else np.inf
+    return len(beyond) > 0 and bool(np.mean(beyond > 0) > 0.6 and beyond.mean() > BEYOND * scatter)
+
+
+def _beside_dynamics(torque: Numbers, joints: Numbers, free: NDArray[np.bool_], rate: float) -> Numbers:
+    """(N,) what linear dynamics of the `joints` (N, n), found from the samples that are `free`, leave of a torque; NaN
+    where nothing is known."""
+    free = free & np.isfinite(joints).all(axis=1)
+    columns = 1 + 4 * joints.shape[1]
+    if free.sum() < 4 * columns:
+        return np.full(len(torque), np.nan)
+    W = np.concatenate([np.ones((len(torque), 1)), *(_linear_dynamics(q, rate) for q in joints.T)], axis=1)
+    return np.asarray(torque - W @ np.linalg.lstsq(W[free], torque[free])[0])
+
+
 def _crowd(x: Numbers, level: float, step: float) -> NDArray[np.bool_] | None:
     """(N,) samples that crowd at the upper end of the range, in the band that shows it best; None where none do."""
-    top = float(np.nanmax(x))
+    top, span = (float(np.nanmax(x)), float(np.ptp(x[np.isfinite(x)]))) if np.isfinite(x).any() else (0.0, 0.0)
+    if not 0 < span < np.inf:
+        return None
     below = top - x
-    span = float(np.nanmax(below))
     exact = below <= 1e-9 * span
     if step == 0 and exact.sum() >= EXACT:
         return exact
     width = max(1.01 * step, 1e-3 * span)
-    most, best, widest = 0, 0.0, min(max(8 * level, width), 0.2 * span)
-    while width <= widest:
-        first = int((below < width).sum())
-        second = int((below < 2 * width).sum()) - first
-        if first >= FEWEST_CROWDED and first > CROWDED * max(second, 1) and first - second > most:
-            most, best = first - second, width
-        width *= 1.3
+    surest, best, widest = 0.0, 0.0, min(max(8 * level, width), 0.2 * span) if np.isfinite(level) else width
+    widths = width * 1.3 ** np.arange(max(0, int(np.log(widest / width) / np.log(1.3)) + 1))
+    near = np.sort(below[below < 2 * widths[-1]])
+    for width, first, both in zip(widths, *np.searchsorted(near, [widths, 2 * widths]).tolist(), strict=True):
+        second = both - first
+        sure = (first - second) / np.sqrt(both + 1)
+        if first >= FEWEST_CROWDED and first > CROWDED * max(second, 1) and sure > surest:
+            surest, best = sure, float(width)
     return below < best if best else None
 
 
 def _linear_dynamics(position: Numbers, rate: float) -> Numbers:
-    """(N, 5) columns of a smoothed motion that does not jump, and of friction."""
+    """(N, 4) columns of a smoothed motion that does not jump, and of friction."""
     from scipy.signal import butter, sosfiltfilt
 
     known = np.isfinite(position)
     q = np.interp(np.arange(len(position)), np.flatnonzero(known), position[known])
     leaps = jumps(q)
     q = np.cumsum(np.where(leaps & np.roll(leaps, 1), 0, np.diff(q, prepend=q[0])))
-    q = sosfiltfilt(butter(2, min(MOTION_CUTOFF, rate / 8), fs=rate, output="sos"), q)
+    q = sosfiltfilt(butter(4, min(MOTION_CUTOFF, rate / 8), fs=rate, output="sos"), q)
     dq = np.gradient(q, 1 / rate)
     ddq = np.gradient(dq, 1 / rate)
-    return np.stack([np.ones_like(q), q, dq, ddq, np.sign(dq)], axis=1)
+    return np.stack([q, dq, ddq, np.sign(dq)], axis=1)
 
 
-def held_for(x: Numbers) -> int:
-    """For how many samples a recorder holds each value of a slower signal (N,); 1 where it does not.
+def dropouts(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
+    """Values that a signal leaps to and keeps to the last digit, outside of all others (N,): a sentinel that stands for
+    nothing measured, such as -999, for however many samples."""
+    out = np.zeros(len(x), bool)
+    known = np.flatnonzero(np.isfinite(x))
+    z = x[known]
+    if len(z) < 2 * LONGEST_GLITCH:
+        return out
+    level = noise_level(z) if noise is None else noise
+    for value in (z.min(), z.max()):
+        at = z == value
+        others = z[~at]
+        if not 2 <= at.sum() < len(others):
+            continue
+        # A limit is where a signal comes to; a sentinel lies as far beyond the range of all else as that is wide.
+        away = min(abs(value - others.min()), abs(value - others.max()))
+        if away > max(np.ptp(others), STANDS_OUT * level):
+            out[known[at]] = True
+    return out
+
+
+def held_updates(x: Numbers) -> NDArray[np.int64] | None:
+    """The samples at which a slower signal was measured that the recorder held until its next value (N,); None where
+    it did not.
 
     A slow encoder repeats values as well, but not for whole multiples of one number of samples.
     """
-    changes = np.flatnonzero(np.diff(x[np.isfinite(x)]) != 0)
+    if not np.isfinite(x).all():
+        return None
+    changes = np.flatnonzero(np.diff(x) != 0) + 1
     between = np.diff(changes)
-    if len(between) < 20 or not (between > 1).all():
-        return 1
+    if len(between) < FEWEST_UPDATES or not (between > 1).all():
+        return None
     k = int(np.bincount(between).argmax())
-    return k if np.mean(between % k == 0) > 0.98 else 1
+    if k > LONGEST_HELD or np.mean(between % k == 0) < 0.98:
+        return None
+    first = int(np.bincount(changes % k).argmax())
+    return np.arange(first, len(x), k)

@@ -12,6 +12,10 @@ DIFFERENCES, FEWEST_DIFFERENCES = (4, 6, 8, 12), 20
 """Orders of differences in which noise is looked for, and how many times as many samples there must be."""
 
 
+SHORT = 3
+"""Missing samples across which a leap is told from motion."""
+
+
 def fill_gaps(x: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Straight lines across the samples that are not valid, so that a filter can pass; (N, k) or (N,)."""
     if valid.all():
@@ -63,7 +67,7 @@ def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool
     """
     from scipy.ndimage import maximum_filter1d
 
-    size = np.abs(np.diff(x))
+    size = np.abs(np.diff(_held_over_gaps(x)))
     size = np.where(np.isfinite(size), size, 0.0)
     leap = size > 20 * (noise_level(x) if noise is None else noise)
     if not leap.any():
@@ -72,6 +76,16 @@ def jumps(x: NDArray[np.float64], noise: float | None = None) -> NDArray[np.bool
     before, after = (nearby[6 + shift : 6 + shift + len(size)] for shift in (-3, 3))
     leap &= size > 6 * np.maximum(before, after)
     return np.r_[leap, False] | np.r_[False, leap]
+
+
+def _held_over_gaps(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """With the last value kept for up to `SHORT` missing samples, so that a leap beside them is one."""
+    missing = ~np.isfinite(x)
+    if not missing.any():
+        return x
+    at = np.arange(len(x))
+    last = np.maximum.accumulate(np.where(missing, 0, at))
+    return np.where(missing & (at - last <= SHORT), x[last], x)
 
 
 def noise_level(x: NDArray[np.float64]) -> float:

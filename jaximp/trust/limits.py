@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class TrustLimits:
     min_excitation_ratio: float = 5.0
     """How far each column must rise above what noise in the position alone would build: a ratio r biases the
     estimate by about 1/r^2, four percent at 5."""
+    max_at_limit: float = 0.02
+    """Share of a window's samples whose torque was cut off at a limit of its sensor or motor; they are left out."""
     min_valid_share: float = 0.5
     """Share of a window's samples that must have been measured and moving."""
     max_asymmetry: float = 0.2
@@ -35,9 +38,22 @@ class TrustLimits:
     surely positive definite (`confidence`) by so many."""
     max_condition: float | None = None
     """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
+    joint_name: str | list[str] | None = None
+    """Which human joint it is (finger, wrist, elbow, shoulder, ankle, knee, hip; of several joints a list), or `other`
+    for what is none: an impedance that it cannot have is not trusted. By default what any human joint can have."""
     parameters: tuple[str, ...] = ()
     """The parameters that matter: only their standard errors and excitation are judged. Empty for all but a constant
     torque."""
+
+    @property
+    def one_joint_name(self) -> str | None:
+        """`joint_name` of the first joint."""
+        return self.joint_name[0] if isinstance(self.joint_name, list) else self.joint_name
+
+    def of_joint(self, j: int, **settings: Any) -> TrustLimits:
+        """Of one joint of several."""
+        name = self.joint_name[j] if isinstance(self.joint_name, list) else self.joint_name
+        return replace(self, joint_name=name, **settings)
 
     @property
     def usual_vaf(self) -> float:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model, Role
+from jaximp.trust import plausibility
 from jaximp.trust.criteria import USUAL, MatrixCriteria, body_margin, matrix_criteria
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, WEAK, Rule, Verdicts, judge_all
@@ -21,6 +22,8 @@ from jaximp.types import Numbers, nearest
 
 POSITIVE_INERTIA = "an inertia above zero"
 """The rule that a wrong sign of the torque breaks."""
+PLAUSIBLE = "an impedance that the joint can have"
+"""The rule that wrong units break."""
 NOTHING_MISSING = "a model that lacks nothing"
 """The rule that a test of the model breaks, for all windows of a record."""
 TOGETHER = 3.0
@@ -78,6 +81,12 @@ class Windows:
     """Whether most windows predict the torque of the next one worse than a constant would."""
     mass_below_zero: float = -np.inf
     """How far the mean inertia of windows side by side is below zero, in standard errors."""
+    at_limit: Any = 0.0
+    """The share of a window's samples whose torque was cut off at a limit."""
+    impedance: Any = None
+    """(M, 3) inertia, damping and stiffness at a human joint; None of anything else."""
+    outside: Any = 1.0
+    """(M, 3) by what factor these lie outside of what the joint can have, see `plausibility.times_outside`."""
     tested: bool = False
     """Whether the model of the whole record was tested for what it lacks."""
     missing: str = ""
@@ -245,6 +254,24 @@ def _indefinite(which: str) -> Rule[Windows]:
     return Rule(f"a {which} that is positive definite", POOR, broken, reason)
 
 
+def _implausible(w: Windows, limits: TrustLimits) -> str:
+    k = int(plausibility.worst(w.outside))
+    times, ranges, value = w.outside[k], plausibility.ranges_of(limits.one_joint_name), w.impedance[k]
+    assert ranges is not None
+    whose = "any human joint" if limits.one_joint_name is None else f"the {limits.one_joint_name}"
+    low, high = ranges.bounds[k]
+    size = f"{times:.3g} times too large" if times > 1 else f"{1 / times:.3g} times too small"
+    return (
+        f"{plausibility.PARAMETERS[k]} is {value:.3g} {plausibility.UNITS[k]}, {size} for {whose} ({low:g} to {high:g})"
+    )
+
+
+def _question(w: Windows, limits: TrustLimits) -> str:
+    ranges = plausibility.ranges_of(limits.one_joint_name)
+    assert ranges is not None
+    return plausibility.question(w.impedance, ranges)
+
+
 def _least_vaf(w: Windows, limits: TrustLimits) -> float:
     """Tests of the model say more than the share of the variance, which noise lowers too."""
     return -np.inf if w.tested and limits.min_vaf is None else limits.usual_vaf
@@ -260,6 +287,14 @@ def _asymmetry(w: Windows, limits: TrustLimits) -> str:
 
 
 EXCITATION: tuple[Rule[Windows], ...] = (
+    Rule(
+        "a torque inside its limits",
+        NO_DATA,
+        # What is left of a torque that was cut off is no fair sample of it.
+        lambda w, limits: np.broadcast_to(w.at_limit > limits.max_at_limit, np.shape(w.samples)),
+        lambda w, limits: f"the torque is cut off at a limit in {w.at_limit:.1%} of the samples",
+        lambda w, limits: "use a larger range of the sensor or the motor, or move less",
+    ),
     Rule(
         "enough samples",
         NO_DATA,
@@ -301,7 +336,7 @@ EXCITATION: tuple[Rule[Windows], ...] = (
     ),
 )
 """What the motion must be for an estimate to say something."""
-MOVES = 3
+MOVES = 4
 """The first of them look at the motion alone."""
 
 RULES: tuple[Rule[Windows], ...] = (
@@ -335,6 +370,13 @@ RULES: tuple[Rule[Windows], ...] = (
         lambda w, limits: w.negative_inertia > limits.max_negative_inertia,
         lambda w, limits: f"the inertia is negative, as no mass can be, by {w.negative_inertia:.2g} standard errors",
         lambda w, limits: "does the torque need sign = -1?",
+    ),
+    Rule(
+        PLAUSIBLE,
+        POOR,
+        lambda w, limits: np.broadcast_to((np.atleast_1d(w.outside) != 1).any(axis=-1), np.shape(w.samples)),
+        _implausible,
+        _question,
     ),
     Rule(
         "friction above zero",

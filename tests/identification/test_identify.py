@@ -124,6 +124,7 @@ def test_joints_side_by_side_are_solved_and_judged_each_by_itself() -> None:
     both = replace(
         good,
         position=np.concatenate([good.position, 2 * good.position], axis=1),
+        position_noise=None,
         torque=np.concatenate([good.torque, unrelated], axis=1),
         joints=("revolute", "revolute"),
     )

@@ -101,7 +101,9 @@ def test_a_prior_pulls_by_its_weight() -> None:
 def test_noise_of_the_position_is_corrected_for() -> None:
     recording = joint()
     noise = np.random.default_rng(1).normal(0, 1e-3, recording.position.shape)
-    found = infer_recording(parse_job(JOB), replace(recording, position=recording.position + noise))
+    found = infer_recording(
+        parse_job(JOB), replace(recording, position=recording.position + noise, position_noise=None)
+    )
     assert found.bias[0] < -0.25
     assert found.why == ""
     z = (found.whole.mean[:4] - list(TRUTH.values())) / found.whole.samples.std(axis=0)[:4]

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import chirp
 
-from jaximp.signals.faults import glitches, held_for, torque_limits
+from jaximp.signals.faults import glitches, held_updates, torque_limits
 
 Numbers = NDArray[np.float64]
 RATE = 500.0
@@ -112,9 +112,11 @@ def test_good_torques_have_no_limits(position: Numbers, torque: Numbers) -> None
 
 def test_held_samples_are_told_from_a_slow_encoder() -> None:
     position = joint(15)[0]
-    assert held_for(np.repeat(position[::10], 10)) == 10
-    assert held_for(position) == 1
-    assert held_for(np.round(position / 5e-3) * 5e-3) == 1
+    found = held_updates(np.repeat(position[::10], 10))
+    assert found is not None
+    np.testing.assert_array_equal(found, np.arange(0, len(position), 10))
+    assert held_updates(position) is None
+    assert held_updates(np.round(position / 5e-3) * 5e-3) is None
 
 
 def test_real_recordings_have_few_glitches_and_no_limit(data_folder: object) -> None:

@@ -27,6 +27,7 @@ from jaximp.signals import (
     filter_in_windows,
     filter_zero_phase,
     filter_zero_phase_decimated,
+    jumps,
     noise_level,
     quantisation_step,
     reach,
@@ -363,6 +364,15 @@ SLOW = 0.4 * np.sin(2 * np.pi * 1.1 * np.arange(20000) / RATE)
 def test_noise_level_of_white_noise(sigma: float, slow: float) -> None:
     x = slow * SLOW + sigma * noise(len(SLOW))
     assert noise_level(x) == pytest.approx(sigma, rel=0.03)
+
+
+@pytest.mark.parametrize("missing", [0, 1, 3])
+def test_a_jump_beside_missing_samples_is_one(missing: int) -> None:
+    x = np.sin(np.arange(2000) / 100)
+    x[1000:] += 0.3
+    x[1000 : 1000 + missing] = np.nan
+    assert np.flatnonzero(jumps(x, 1e-6)).tolist() == [999 + missing, 1000 + missing]
+    assert not jumps(np.where(np.arange(2000) // 3 % 50 == 0, np.nan, np.sin(np.arange(2000) / 100)), 1e-6).any()
 
 
 def test_noise_level_ignores_jumps_and_gaps() -> None:
