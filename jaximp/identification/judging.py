@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.identification.comparisons import by_frequency, changes
+from jaximp.identification.corrections import corrected
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.misfit import by_bands, harmless, in_words, missing, off_by, sizes, unnoticed
 from jaximp.identification.pipeline import Pipeline
@@ -49,7 +50,7 @@ def judge(
     """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
     pipeline, model = prepared.pipeline, prepared.model
     solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
-    fit, starts = solved.fit, place.starts[: len(solved.fit.last)]
+    fit, starts = _corrected(prepared, rows, solved.fit, place), place.starts[: len(solved.fit.last)]
     held_out = _held_out(solved)
     threshold, why_not = _threshold(prepared, place, method)
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
@@ -111,6 +112,14 @@ def _judged_by_the_human(
     seen = score(rows.W, rows.torque, valid, fit.theta, starts, place.window, place.step, place.given_room)
     quality = (seen.vaf, seen.residual_rms, seen.samples)
     return eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
+
+
+def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement) -> SlidingFit:
+    """Estimates of white rows without what noise of the position and change inside the windows do to them."""
+    if len(prepared.white) != 1:
+        return fit
+    white = prepared.white[0]
+    return corrected(fit, white.W, white.noisy, rows.valid, _apart(place))
 
 
 def _held_out(solved: Solved) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp.identification.corrections import noise_in_band
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import RobotTests
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
@@ -20,6 +21,10 @@ from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model
 from jaximp.types import Recording
+
+
+CLEARLY_MORE = 1.5
+"""Times the variance of the noise that its samples show."""
 
 
 @dataclass(frozen=True)
@@ -152,9 +157,18 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
     recording, pipeline = measured.recording, measured.pipeline
     reference = pipeline.reference_motion(recording)
     white = tuple(whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
+    if len(white) == 1 and white[0].noisy is not None and rows.torque.ndim == 1:
+        white = (with_noise_in_band(rows, white[0]),)
     if white:
         noise = np.concatenate([one.column_noise for one in white])
     return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
+
+
+def with_noise_in_band(rows: Rows, white: White) -> White:
+    """With as much noise of the position as is seen inside the band of one joint."""
+    theta = np.linalg.lstsq(white.W[rows.valid], white.torque[rows.valid])[0]
+    times = noise_in_band(rows.W, rows.torque, rows.noisy, rows.valid, theta)
+    return replace(white, noisy=np.sqrt(times) * white.noisy) if times > CLEARLY_MORE else white
 
 
 def whitened(pipeline: Pipeline, rows: Rows) -> Iterator[White]:
