@@ -275,13 +275,18 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     return f"the model lacks {culprits(misfits)}: {', '.join(changes)}" if off else ""
 
 
-def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
-    """Parameters that depend on the frequencies that least squares weighs, and how, in words."""
+def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str], ordinary: bool = False) -> dict[str, str]:
+    """Parameters that depend on the frequencies that least squares weighs, and how, in words.
+
+    **Arguments:** whether the estimates are `ordinary`, so that the others are those to compare with.
+    """
     if bands is None:
         return {}
+    other, counts = ("generalised", "less") if ordinary else ("ordinary", "more")
+    found, usual = (bands.generalised, bands.ordinary) if ordinary else (bands.ordinary, bands.generalised)
     return {
-        name: f"{name} depends on the frequency (ordinary least squares, which counts slow motion more, finds "
-        f"{bands.ordinary[k]:.3g} and not {bands.generalised[k]:.3g} {unit})"
+        name: f"{name} depends on the frequency ({other} least squares, which counts slow motion {counts}, finds "
+        f"{found[k]:.3g} and not {usual[k]:.3g} {unit})"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
         if bands.apart(k)
     }

@@ -152,7 +152,7 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
     recording, pipeline = measured.recording, measured.pipeline
     reference = pipeline.reference_motion(recording)
     white = tuple(whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
-    if white:
+    if white and not pipeline.ordinary:
         noise = np.concatenate([one.column_noise for one in white])
     return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
 

@@ -11,8 +11,9 @@ judge by frequencies that it took away. So it looks back in steps of `every` row
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ SETTLED = 1e-5
 ROUNDING = 1e-15
 """Of sums of products: so much is left of a column at least where a long step of the search goes to noise that takes it
 away."""
+SLOWEST, FORGOTTEN = 0.9999, 1e-11
+"""Root of the slowest noise whose density is resolved, and the share of noise that counts as forgotten."""
 NEARLY_ONE, FARTHEST_START = 1 - 1e-9, 0.9999
 """Largest reflection coefficient, and that from which a longer autoregression is searched."""
 
@@ -86,6 +89,16 @@ class Autoregression:
             else:
                 r.append(float(-a[1:] @ np.array(r[: -self.order - 1 : -1])))
         return np.array(r)
+
+
+def density_of(several: Sequence[Autoregression], lags: int) -> Numbers:
+    """(F,) spectral density of noise which autoregressions, one after the other, turn into white noise of unit
+    variance: at even steps from zero to half a cycle per term, so fine that its inverse transform is right at so many
+    lags."""
+    polynomial = reduce(np.convolve, (one.polynomial for one in several), np.ones(1))
+    root = min(SLOWEST, np.abs(np.roots(polynomial)).max(initial=0.5))
+    memory = 2 * lags + np.log(FORGOTTEN) / np.log(root)
+    return np.asarray(1 / np.abs(np.fft.rfft(polynomial, 1 << int(np.ceil(np.log2(memory))))) ** 2)
 
 
 def autoregression_of(autocovariance: Num[AnyArray, " L"], every: int = 1) -> Autoregression:
