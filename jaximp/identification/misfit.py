@@ -79,7 +79,7 @@ class RobotTests:
         columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
         white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
         tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
-        tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque))
+        tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque), moved_in=None)
         lacking, W = _suspected(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
@@ -127,6 +127,8 @@ class Tests:
     every: int
     fit: DisjointFit | None = None
     """Of these rows in windows side by side, where it is known."""
+    moved_in: tuple[Numbers, Mapping[str, Numbers]] | None = None
+    """Columns and groups as they were filtered, where parameters move by those (`Pipeline.ordinary`)."""
 
     @classmethod
     def of(
@@ -136,18 +138,21 @@ class Tests:
         W, torque = np.asarray(white.W), np.asarray(white.torque)
         outputs = 1 if torque.ndim == 1 else torque.shape[1]
         counts = np.asarray(valid, bool).reshape(-1, outputs)
-        whole = {}
+        whole, filtered = {}, {}
         for name, by_output in groups:
-            columns = np.zeros((*counts.shape, next(iter(by_output.values())).shape[1]))
+            columns, plain = np.zeros((2, *counts.shape, next(iter(by_output.values())).shape[1]))
             for j, acting in by_output.items():
                 columns[:, j] = white.apply(acting, counts[:, j], j)
-            whole[name] = columns.reshape(-1, columns.shape[-1])
+                plain[:, j] = np.where(counts[:, j, None], acting, 0)
+            whole[name], filtered[name] = (x.reshape(-1, columns.shape[-1]) for x in (columns, plain))
         W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
-        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every, white.windows)
+        moved_in = None if white.as_filtered is None else (np.reshape(white.as_filtered, W.shape), filtered)
+        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every, white.windows, moved_in)
 
     def __call__(self) -> list[Misfit]:
         """Test every group."""
-        return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every, self.fit)
+        given = (self.valid, self.window, self.every, self.fit, self.moved_in)
+        return score_groups(self.W, self.torque, self.groups, *given)
 
     def with_other(self, **rows: Any) -> Tests:
         """With other rows or windows, whose fit is not known yet."""
@@ -163,7 +168,7 @@ class Tests:
             if name not in gone and (joint is None or untagged(name)[1] != joint)
         }
         columns = np.concatenate([self.groups[name] for name in sorted(gone)], axis=1)
-        (together,) = replace(self, groups={"together": columns})()
+        (together,) = replace(self, groups={"together": columns}, moved_in=None)()
         return self.with_other(torque=self.torque - columns @ together.weights, groups=others)
 
 

@@ -75,12 +75,14 @@ def score_groups(
     window: int,
     every: int = 1,
     fit: DisjointFit | None = None,
+    moved_in: tuple[Numbers, Mapping[str, Numbers]] | None = None,
 ) -> list[Misfit]:
     """Test every group of added columns.
 
     **Arguments:** `W` (N, p) and `y` (N,) rows whose noise is white; `groups` of further columns (N, g) that went
     through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one;
-    `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns.
+    `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns;
+    `moved_in` columns (N, p) and groups in rows by which the parameters move, where these are not the white ones.
 
     **Source:** score test with a covariance that knows nothing of the noise's size row by row (White 1980; residuals
     scaled by their leverage).
@@ -90,6 +92,10 @@ def score_groups(
         groups = {name: np.where(valid[:, None], columns, 0) for name, columns in groups.items()}
         fit = fit_disjoint(W, y, valid, window)
     sums = _sums(W, list(groups.values()), fit, every)
+    if moved_in is not None:
+        columns, others = moved_in
+        passed = _passed(columns, [others[name] for name in groups], window, with_say(fit, every))
+        sums = sums._replace(passed=passed)
     found, first = [], 0
     for name, columns in groups.items():
         own = slice(first, first := first + columns.shape[1])
@@ -127,6 +133,14 @@ def _sums(W: Numbers, groups: Sequence[Numbers], fit: DisjointFit, every: int) -
         passed += fit.inverse[k] @ within.T / len(chosen)
         size += np.einsum("gt,gt->g", z, z) / variance
     return _Sums(gram, spread, score, passed, np.sqrt(size), float(freedom.sum()))
+
+
+def _passed(W: Numbers, groups: Sequence[Numbers], window: int, chosen: NDArray[np.int64]) -> Numbers:
+    """(p, G) what each column adds to the parameters by least squares of these rows, on the mean over some windows."""
+    z = np.concatenate(groups, axis=1)
+    parts = [slice(k * window, (k + 1) * window) for k in chosen.tolist()]
+    found = [np.linalg.lstsq(W[part], z[part])[0] for part in parts]
+    return np.mean(found, axis=0) if found else np.zeros((W.shape[1], z.shape[1]))
 
 
 def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
