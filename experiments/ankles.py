@@ -243,7 +243,7 @@ def backlash(play: float) -> Wrong:
             follows[k] = min(max(follows[k - 1], q[k] - play / 2), q[k] + play / 2)
         return motion.through(lambda s: INERTIA * s**2 + DAMPING * s) + STIFFNESS * follows
 
-    return Wrong(torque, ("friction", "stiffness"))
+    return Wrong(torque, ("play",))
 
 
 WRONG: Mapping[str, Wrong] = {
