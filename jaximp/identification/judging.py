@@ -55,7 +55,7 @@ def judge(
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
-    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary)
+    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary, weights)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
@@ -192,8 +192,10 @@ class _OfModel:
         place: Placement,
         judged: Sequence[str],
         ordinary: bool,
+        weights: set[str],
     ) -> _OfModel:
-        """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not."""
+        """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not; `weights` of a
+        reflex, of which nothing is said one by one."""
         theta = np.asarray(solved.fit.theta)
         size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
         tests = (misfits, model.names, size, [role.kind for role in model.roles])
@@ -206,7 +208,7 @@ class _OfModel:
         others = [text for name, text in lacking.items() if name in judged and name not in off]
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
-        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests)))
+        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests, spared=weights)))
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,10 +14,12 @@ from jaximp.identification.regression import Rows
 from jaximp.identification.separation import Regression, Separation, Whiten
 from jaximp.identification.suspects import (
     OF_MUSCLES,
+    ROBOT,
     has_muscles,
     of_arm,
     of_one_joint,
     of_robot,
+    owner,
     remedy,
     untagged,
     what,
@@ -25,7 +27,7 @@ from jaximp.identification.suspects import (
 from jaximp.identification.whitening import White
 from jaximp.least_squares.disjoint import DisjointFit
 from jaximp.models.base import Role
-from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
+from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, noticed, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
 HIDES = {"lag": "stiffness"}
@@ -309,14 +311,48 @@ def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kin
     return f"the model lacks {culprits(misfits)}, which moves no parameter by more than {SHARE:.0%} or beyond error"
 
 
-def unnoticed(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
-    """How far each parameter might be off without any test noticing it: twice the largest error of a move."""
+def unnoticed(
+    misfits: Sequence[Misfit],
+    names: Sequence[str],
+    size: Numbers,
+    kinds: Sequence[str] = (),
+    spared: Container[str] = (),
+) -> str:
+    """How late the torque might come, and how far each parameter might be off, without any test noticing it: twice the
+    largest error of a move.
+
+    **Arguments:** `spared` names of which nothing is said.
+    """
     if not misfits:
         return ""
-    blind = ERRORS * np.max([one.stderr for one in misfits], axis=0)
-    share: NDArray[np.float64] = blind / np.where(size > 0, size, np.inf)
-    worst = misfits[int(np.argmax(np.max([one.stderr / np.where(size > 0, size, np.inf) for one in misfits], axis=1)))]
-    blinded = ", ".join(f"{name} by {part:.0%}" for name, part in zip(names, share, strict=True) if part > SHARE)
-    if not blinded:
+    size = np.array([np.inf if name in spared or not s > 0 else s for name, s in zip(names, size, strict=True)])
+    shares = ERRORS * np.array([one.stderr for one in misfits]) / size
+    worst = misfits[int(np.argmax(shares.max(axis=1)))]
+    blinded = [f"{name} by {part:.0%}" for name, part in zip(names, shares.max(axis=0), strict=True) if part > SHARE]
+    said = [_unnoticed_delay(misfits, size, kinds)]
+    said += [f"{what(worst.group)}, say, could move {', '.join(blinded)} unnoticed"] if blinded else []
+    return f"this motion cannot show everything: {'; '.join(filter(None, said))}" if any(said) else ""
+
+
+def _unnoticed_delay(misfits: Sequence[Misfit], size: Numbers, kinds: Sequence[str]) -> str:
+    """The longest delay that every second record would not show, of the joint that shows it least; empty where it moves
+    no parameter by more than `SHARE`.
+
+    To slow motion a spring k in series is a delay of 2 damping / k; it hides stiffness / k of the stiffness.
+    """
+    of, errors = dict(zip(kinds, size, strict=False)), noticed(misfits)
+    late: dict[str, float] = {}
+    for one in misfits:
+        if is_delay(one.group) and owner(one.group) != ROBOT and (errors * one.stderr > SHARE * size).any():
+            column = 1.0 if owner(one.group) else of.get("inertia", np.inf)  # of an arm the torque's own slope
+            late[one.group] = errors * float(one.weights_stderr[0]) / column
+    if not late or not max(late.values()):
         return ""
-    return f"this motion cannot show everything: {what(worst.group)}, say, could move {blinded} unnoticed"
+    group = max(late, key=late.__getitem__)
+    whose = f" of {owner(group)}" if owner(group) else ""
+    text = f"a delay{whose} of up to {1e3 * late[group]:.2g} ms would go unnoticed"
+    if not owner(group) and np.isfinite([of.get(kind, np.inf) for kind in ("damping", "stiffness")]).all():
+        hidden = late[group] * of["stiffness"] / (2 * of["damping"])
+        if hidden > SHARE:
+            text += f", and so would what yields as much and hides up to {hidden:.0%} of the stiffness"
+    return text

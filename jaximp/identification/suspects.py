@@ -213,6 +213,11 @@ def untagged(group: str) -> tuple[str, int | None]:
     return name, int(whose.split()[-1]) - 1 if whose.startswith("joint") else None
 
 
+def owner(group: str) -> str:
+    """Whose a group is: `joint 2`, `robot`, or nobody's where there is one joint."""
+    return group.rpartition(": ")[0]
+
+
 def what(group: str) -> str:
     """What a group stands for, in words: `dry friction of joint 2`."""
     whose, _, name = group.rpartition(": ")

@@ -49,6 +49,8 @@ class Misfit:
     """(p,) by how much the parameters would change, on the mean over the windows, if the columns were in the model."""
     stderr: Numbers
     """(p,) of that."""
+    weights_stderr: Numbers
+    """(g,)"""
 
 
 class _Sums(NamedTuple):
@@ -166,6 +168,7 @@ def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
         weights=kept @ weights / size,
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),
+        weights_stderr=np.sqrt(np.einsum("ij,jk,ik->i", kept, covariance, kept)) / size,
     )
 
 
@@ -219,6 +222,13 @@ def significant(tests: Sequence[Misfit], level: float = FAMILYWISE) -> list[Misf
             break
         found.append(one)
     return sorted(found, key=lambda one: -one.evidence)
+
+
+def noticed(tests: Sequence[Misfit], level: float = FAMILYWISE) -> float:
+    """How many of its errors large the weight of a single column is that every second record shows."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(level / 2 / len(tests)))
 
 
 def p_in_words(p: float) -> str:
