@@ -29,6 +29,9 @@ WORSE = 6.0
 """How much worse the criterion may become before no higher order is tried."""
 ROWS_PER_TERM = 4
 """A window has so many independent rows for each term of the autoregression, at least."""
+ENOUGH, JOINED, MOST_COLUMNS = 16, 32, 28
+"""Windows that are too short to tell an order that is enough for most noise are looked at several in a row: as many as
+tell the highest one, up to so many parameters of all."""
 FEWEST_WINDOWS = 20
 """Independent rows of all windows together, for each term."""
 LOST = 1e-10
@@ -158,6 +161,7 @@ def fit_window_noise(
     **Source:** restricted likelihood: Patterson and Thompson 1971; the exact likelihood of an autoregression as a
     quadratic form: Box, Jenkins and Reinsel, Time series analysis, appendix A7.5.
     """
+    W, window = _joined(np.asarray(W), window, every)
     stretches = _stretches(np.asarray(valid, bool), window, every)
     parameters = W.shape[-1]
     rows = sum(sum(len(run) for run in runs) for runs in stretches) / every
@@ -179,6 +183,21 @@ def fit_window_noise(
             break
         best = min(best, (criterion, start), key=lambda one: one[0])
     return Autoregression(best[1], every)
+
+
+def _joined(W: Numbers, window: int, every: int) -> tuple[Numbers, int]:
+    """Columns and rows of windows that are long enough to tell the noise: where they are not, of several in a row, each
+    with parameters of its own."""
+    n, p = W.shape
+    told = window / every - p
+    if not p or not 0 < told < ROWS_PER_TERM * ENOUGH:
+        return W, window
+    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, n // window)
+    if count < 2:
+        return W, window
+    apart = np.zeros((n, count, p))
+    apart[np.arange(n), np.arange(n) // window % count] = W
+    return apart.reshape(n, -1), count * window
 
 
 def whiten_rows(
