@@ -243,7 +243,7 @@ def backlash(play: float) -> Wrong:
             follows[k] = min(max(follows[k - 1], q[k] - play / 2), q[k] + play / 2)
         return motion.through(lambda s: INERTIA * s**2 + DAMPING * s) + STIFFNESS * follows
 
-    return Wrong(torque, ("friction", "stiffness"))
+    return Wrong(torque, ("play",))
 
 
 WRONG: Mapping[str, Wrong] = {
@@ -298,12 +298,16 @@ def record(
 
 
 def pipeline(
-    rate: float = RATE, window: float = 2.0, high_pass: float | None = None, noise: str = "estimated"
+    rate: float = RATE,
+    window: float = 2.0,
+    high_pass: float | None = None,
+    noise: str = "estimated",
+    estimates: str = "generalised",
 ) -> Pipeline:
     """Windows side by side, behind a low-pass above the motion, or below the fastest frequency there is."""
     return Pipeline(
         rate,
         HumanJoint(offset=high_pass is None),
-        WindowSettings(window, step=window, noise=noise),
+        WindowSettings(window, step=window, noise=noise, estimates=estimates),
         FilterSettings(position_cutoff=min(40.0, 0.45 * rate), decimation_cutoff=20.0, high_pass=high_pass),
     )

@@ -8,15 +8,18 @@ experiments/results/coverage.json and coverage.md.
 
 2000 simulated records of an ankle a cell, through `identify` (`noise`): torque noise of every kind, short and long
 windows, slow and fast sampling, a high-pass, an encoder, several motions. Of each record one window counts, the middle
-one, whatever its verdict. Writes experiments/results/coloured_noise.json and coloured_noise.md.
+one, whatever its verdict. Writes experiments/results/coloured_noise.json and coloured_noise.md. Of ordinary
+estimates with errors that know the noise (`--estimates ordinary`) it writes coloured_noise_ordinary.json and
+coloured_noise_ordinary.md, with how wide their intervals are against those of generalised least squares.
 
-    python experiments/coverage.py [filters | noise] [--records 2000]
+    python experiments/coverage.py [filters | noise] [--records 2000] [--estimates ordinary] [--cases usual ...]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,7 @@ from scipy.stats import t as student
 
 from jaximp import signals
 from jaximp.identification.identify import estimate
+from jaximp.identification.pipeline import ESTIMATES
 from jaximp.least_squares import WindowFit, least_squares
 from jaximp.models import HumanJoint
 from jaximp.simulation import ROBOT_TRAJECTORY, HumanLoad, Rig, simulate_rig
@@ -196,10 +200,12 @@ ALLOWED, CLAIMED = 0.02, (0.9, 1.15)
 """Target: coverage within so much and 3.5 Monte Carlo errors, and claimed over true standard deviation."""
 
 
-def noise_cell(noise: str, case: dict[str, Any], records: int, seed: int) -> dict[str, Any]:
+def noise_cell(noise: str, case: dict[str, Any], records: int, seed: int, estimates: str) -> dict[str, Any]:
     """Coverage, claimed over true standard deviation and bias of every parameter, of independent records."""
     settings = {"window": 2.0, "rate": ankles.RATE, "high_pass": None} | case
-    pipeline = ankles.pipeline(*(settings.pop(name) for name in ("rate", "window", "high_pass")))
+    pipeline = ankles.pipeline(
+        *(settings.pop(name) for name in ("rate", "window", "high_pass")), "estimated", estimates
+    )
     theta, stderr, dof, trusted = [], [], [], []
     for k in range(records):
         random = np.random.default_rng((seed, k))
@@ -217,6 +223,7 @@ def noise_cell(noise: str, case: dict[str, Any], records: int, seed: int) -> dic
         | {
             "claimed_over_true_sd": float(np.sqrt(np.mean(claimed[:, k] ** 2)) / error[:, k].std()),
             "bias": float(error[:, k].mean() / truth[k]),
+            "claimed": float(np.sqrt(np.mean(claimed[:, k] ** 2)) / truth[k]),
             "bias_monte_carlo_error": float(error[:, k].std() / np.sqrt(records) / truth[k]),
         }
         for k, name in enumerate(PARAMETERS)
@@ -281,23 +288,53 @@ def noise_table(cells: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def of_noise(records: int) -> None:
+def width_table(cells: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]]) -> str:
+    """How wide the intervals of ordinary estimates are, by those of generalised ones of the same records."""
+    cases = list(next(iter(cells.values())))
+    lines = [
+        "Standard errors of inertia / damping / stiffness, as multiples of those of generalised least squares:",
+        "",
+    ]
+    lines += ["| | " + " | ".join(cases) + " |", "| --- |" + " --- |" * len(cases)]
+    for noise, row in cells.items():
+        ratios = [
+            " / ".join(
+                f"{cell['parameters'][n]['claimed'] / others[noise][case]['parameters'][n]['claimed']:.2f}"
+                for n in PARAMETERS
+            )
+            for case, cell in row.items()
+        ]
+        lines.append(f"| {noise} | " + " | ".join(ratios) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def of_noise(records: int, estimates: str, cases: Sequence[str]) -> None:
     """The second part; what is done so far stands in the files after every case."""
-    cells: dict[str, dict[str, Any]] = {noise: {} for noise in ankles.NOISES}
+    kinds = ["generalised", estimates][estimates == "generalised" :]
+    cells: dict[str, Any] = {kind: {noise: {} for noise in ankles.NOISES} for kind in kinds}
+    file = "coloured_noise" if estimates == "generalised" else f"coloured_noise_{estimates}"
     for c, (name, case) in enumerate(CASES.items()):
-        for k, noise in enumerate(cells):
-            cells[noise][name] = noise_cell(noise, case, records, 100 * c + k)
-        (FOLDER / "coloured_noise.json").write_text(json.dumps(cells, indent=1) + "\n")
-        (FOLDER / "coloured_noise.md").write_text(noise_table(cells))
-    print(noise_table(cells))
+        if name not in cases:
+            continue
+        for k, noise in enumerate(ankles.NOISES):
+            for kind in kinds:
+                cells[kind][noise][name] = noise_cell(noise, case, records, 100 * c + k, kind)
+        table = noise_table(cells[estimates])
+        if estimates != "generalised":
+            table += "\n" + width_table(cells[estimates], cells["generalised"])
+        (FOLDER / f"{file}.json").write_text(json.dumps(cells[estimates], indent=1) + "\n")
+        (FOLDER / f"{file}.md").write_text(table)
+    print(table)
 
 
 if __name__ == "__main__":
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("part", nargs="?", choices=("filters", "noise"), help="both where none is named")
     arguments.add_argument("--records", type=int, default=NOISE_RECORDS, help="of every cell of the second part")
+    arguments.add_argument("--estimates", choices=ESTIMATES, default=ESTIMATES[0], help="of the second part")
+    arguments.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="of the second part")
     given = arguments.parse_args()
     if given.part != "noise":
         of_filters()
     if given.part != "filters":
-        of_noise(given.records)
+        of_noise(given.records, given.estimates, given.cases)

@@ -227,7 +227,7 @@ def _kind_of(found: Measured) -> tuple[Any, ...]:
     pipeline, filters = found.pipeline, found.pipeline.filters
     lags = 0 if filters.noise is None else -(-len(filters.noise) // LAGS_GRAIN)
     half = filters.differentiator.half
-    return found.model, filters.decimate, half, pipeline.window_rows, pipeline.step_rows, lags
+    return found.model, filters.decimate, half, pipeline.window_rows, pipeline.step_rows, lags, pipeline.ordinary
 
 
 def _prepared(several: Sequence[Measured], padded: int, stacked: int) -> list[Prepared | ValueError]:

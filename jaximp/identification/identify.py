@@ -23,7 +23,7 @@ from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, pre
 from jaximp.identification.regression import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
-from jaximp.identification.whitening import from_white
+from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Joints, combine
@@ -95,21 +95,26 @@ def in_windows(
     if prepared.pair is not None:
         return _by_methods(prepared, prepared.pair, place, progress, curves)
 
-    white = prepared.white[0] if prepared.white else None
+    white, ordinary = prepared.white[0] if prepared.white else None, prepared.pipeline.ordinary
     solve = partial(sliding_least_squares, window=place.window, step=place.step, room=place.given_room)
     solve = partial(solve, valid=jnp.asarray(rows.valid), noise=None if white else prepared.noise)
     W, torque = (jnp.asarray(x) for x in ((white.W, white.torque) if white else (rows.W, rows.torque)))
-    fit = solve(W, torque)
+    fit, beside = solve(W, torque), None
     gain = solve(with_gain(prepared.model, W), torque) if prepared.model.memory else None
-    ordinary = None
     if white:
-        ordinary = solve(jnp.asarray(rows.W), rows.torque)
-        seen = score(
-            rows.W, rows.torque, rows.valid, fit.theta, place.starts, place.window, place.step, place.given_room
-        )
-        fit = from_white(fit, ordinary, white, seen)
-        gain = None if gain is None else from_white(gain, ordinary, replace(white, inflation=np.ones(1)))
-    solved, misfits = _predict(rows, fit, place)._replace(ordinary=ordinary), _misfits(prepared, fit)
+        as_filtered = solve(jnp.asarray(rows.W), rows.torque)
+        if ordinary:
+            if gain is not None:
+                columns = with_gain(prepared.model, jnp.asarray(white.as_filtered))
+                gain = from_filtered(gain, solve(columns, rows.torque), white, columns)
+            fit, beside = from_filtered(fit, as_filtered, white), fit
+        else:
+            seen = score(
+                rows.W, rows.torque, rows.valid, fit.theta, place.starts, place.window, place.step, place.given_room
+            )
+            fit, beside = from_white(fit, as_filtered, white, seen), as_filtered
+            gain = None if gain is None else from_white(gain, as_filtered, replace(white, inflation=np.ones(1)))
+    solved, misfits = _predict(rows, fit, place)._replace(beside=beside), _misfits(prepared, fit)
     return [judge(prepared, rows, solved, place, gain=gain, curves=curves, misfits=misfits)]
 
 
@@ -159,7 +164,7 @@ def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Prog
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
         solved = _predict(human, found.fit, place)
         notes, own = (METHODS[method], found.warning, pair.tests.note if pair.tests else ""), prepared
-        if found.white is not None and rows.noisy is not None:
+        if found.white is not None and rows.noisy is not None and not prepared.pipeline.ordinary:
             noisy = found.white.apply(rows.noisy[:n, len(pair.robot.names) :], rows.valid[:n])
             own = replace(prepared, column_noise=np.sqrt((noisy**2).mean(axis=0)))
         misfits = _human_misfits(prepared, pair, found, method)

@@ -56,7 +56,7 @@ def judge(
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
-    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits))
+    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary, weights)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
@@ -115,11 +115,11 @@ def _judged_by_the_human(
 
 
 def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement) -> SlidingFit:
-    """Estimates of white rows without what noise of the position and change inside the windows do to them."""
+    """Where the torque's noise is estimated: without what noise of the position and change inside windows do."""
     if len(prepared.white) != 1:
         return fit
-    white = prepared.white[0]
-    return corrected(fit, white.W, white.noisy, rows.valid, _apart(place))
+    solved = rows if prepared.pipeline.ordinary else prepared.white[0]
+    return corrected(fit, solved.W, solved.noisy, rows.valid, _apart(place))
 
 
 def _held_out(solved: Solved) -> NDArray[np.float64]:
@@ -194,21 +194,30 @@ class _OfModel:
 
     @classmethod
     def of(
-        cls, model: Model, solved: Solved, misfits: tuple[Misfit, ...], place: Placement, judged: Sequence[str]
+        cls,
+        model: Model,
+        solved: Solved,
+        misfits: tuple[Misfit, ...],
+        place: Placement,
+        judged: Sequence[str],
+        ordinary: bool,
+        weights: set[str],
     ) -> _OfModel:
+        """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not; `weights` of a
+        reflex, of which nothing is said one by one."""
         theta = np.asarray(solved.fit.theta)
         size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
         tests = (misfits, model.names, size, [role.kind for role in model.roles])
         off, bands = off_by(*tests), None
         why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
-        if solved.ordinary is not None and misfits:
-            apart = _apart(place)
-            bands = compare_bands(np.asarray(solved.ordinary.theta)[::apart], theta[::apart])
-        lacking = by_bands(bands, model.names, model.units)
+        if solved.beside is not None and misfits:
+            both = np.asarray(solved.beside.theta)[:: _apart(place)], theta[:: _apart(place)]
+            bands = compare_bands(*(both[::-1] if ordinary else both))
+        lacking = by_bands(bands, model.names, model.units, ordinary)
         others = [text for name, text in lacking.items() if name in judged and name not in off]
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
-        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests)))
+        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests, spared=weights)))
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

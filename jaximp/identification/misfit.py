@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,10 +14,12 @@ from jaximp.identification.regression import Rows
 from jaximp.identification.separation import Regression, Separation, Whiten
 from jaximp.identification.suspects import (
     OF_MUSCLES,
+    ROBOT,
     has_muscles,
     of_arm,
     of_one_joint,
     of_robot,
+    owner,
     remedy,
     untagged,
     what,
@@ -25,7 +27,7 @@ from jaximp.identification.suspects import (
 from jaximp.identification.whitening import White
 from jaximp.least_squares.disjoint import DisjointFit
 from jaximp.models.base import Role
-from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, score_groups, significant
+from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, noticed, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
 HIDES = {"lag": "stiffness"}
@@ -79,7 +81,7 @@ class RobotTests:
         columns = {name: one for name, one in of_one_joint(pipeline, recording) if name not in OF_MUSCLES}
         white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
         tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
-        tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque))
+        tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque), moved_in=None)
         lacking, W = _suspected(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
@@ -127,6 +129,8 @@ class Tests:
     every: int
     fit: DisjointFit | None = None
     """Of these rows in windows side by side, where it is known."""
+    moved_in: tuple[Numbers, Mapping[str, Numbers]] | None = None
+    """Columns and groups as they were filtered, where parameters move by those (`Pipeline.ordinary`)."""
 
     @classmethod
     def of(
@@ -136,18 +140,21 @@ class Tests:
         W, torque = np.asarray(white.W), np.asarray(white.torque)
         outputs = 1 if torque.ndim == 1 else torque.shape[1]
         counts = np.asarray(valid, bool).reshape(-1, outputs)
-        whole = {}
+        whole, filtered = {}, {}
         for name, by_output in groups:
-            columns = np.zeros((*counts.shape, next(iter(by_output.values())).shape[1]))
+            columns, plain = np.zeros((2, *counts.shape, next(iter(by_output.values())).shape[1]))
             for j, acting in by_output.items():
                 columns[:, j] = white.apply(acting, counts[:, j], j)
-            whole[name] = columns.reshape(-1, columns.shape[-1])
+                plain[:, j] = np.where(counts[:, j, None], acting, 0)
+            whole[name], filtered[name] = (x.reshape(-1, columns.shape[-1]) for x in (columns, plain))
         W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
-        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every, white.windows)
+        moved_in = None if white.as_filtered is None else (np.reshape(white.as_filtered, W.shape), filtered)
+        return cls(W, torque.ravel(), counts.ravel(), whole, window, white.every, white.windows, moved_in)
 
     def __call__(self) -> list[Misfit]:
         """Test every group."""
-        return score_groups(self.W, self.torque, self.groups, self.valid, self.window, self.every, self.fit)
+        given = (self.valid, self.window, self.every, self.fit, self.moved_in)
+        return score_groups(self.W, self.torque, self.groups, *given)
 
     def with_other(self, **rows: Any) -> Tests:
         """With other rows or windows, whose fit is not known yet."""
@@ -163,7 +170,7 @@ class Tests:
             if name not in gone and (joint is None or untagged(name)[1] != joint)
         }
         columns = np.concatenate([self.groups[name] for name in sorted(gone)], axis=1)
-        (together,) = replace(self, groups={"together": columns})()
+        (together,) = replace(self, groups={"together": columns}, moved_in=None)()
         return self.with_other(torque=self.torque - columns @ together.weights, groups=others)
 
 
@@ -275,13 +282,18 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     return f"the model lacks {culprits(misfits)}: {', '.join(changes)}" if off else ""
 
 
-def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
-    """Parameters that depend on the frequencies that least squares weighs, and how, in words."""
+def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str], ordinary: bool = False) -> dict[str, str]:
+    """Parameters that depend on the frequencies that least squares weighs, and how, in words.
+
+    **Arguments:** whether the estimates are `ordinary`, so that the others are those to compare with.
+    """
     if bands is None:
         return {}
+    other, counts = ("generalised", "less") if ordinary else ("ordinary", "more")
+    found, usual = (bands.generalised, bands.ordinary) if ordinary else (bands.ordinary, bands.generalised)
     return {
-        name: f"{name} depends on the frequency (ordinary least squares, which counts slow motion more, finds "
-        f"{bands.ordinary[k]:.3g} and not {bands.generalised[k]:.3g} {unit})"
+        name: f"{name} depends on the frequency ({other} least squares, which counts slow motion {counts}, finds "
+        f"{found[k]:.3g} and not {usual[k]:.3g} {unit})"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
         if bands.apart(k)
     }
@@ -299,14 +311,48 @@ def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kin
     return f"the model lacks {culprits(misfits)}, which moves no parameter by more than {SHARE:.0%} or beyond error"
 
 
-def unnoticed(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
-    """How far each parameter might be off without any test noticing it: twice the largest error of a move."""
+def unnoticed(
+    misfits: Sequence[Misfit],
+    names: Sequence[str],
+    size: Numbers,
+    kinds: Sequence[str] = (),
+    spared: Container[str] = (),
+) -> str:
+    """How late the torque might come, and how far each parameter might be off, without any test noticing it: twice the
+    largest error of a move.
+
+    **Arguments:** `spared` names of which nothing is said.
+    """
     if not misfits:
         return ""
-    blind = ERRORS * np.max([one.stderr for one in misfits], axis=0)
-    share: NDArray[np.float64] = blind / np.where(size > 0, size, np.inf)
-    worst = misfits[int(np.argmax(np.max([one.stderr / np.where(size > 0, size, np.inf) for one in misfits], axis=1)))]
-    blinded = ", ".join(f"{name} by {part:.0%}" for name, part in zip(names, share, strict=True) if part > SHARE)
-    if not blinded:
+    size = np.array([np.inf if name in spared or not s > 0 else s for name, s in zip(names, size, strict=True)])
+    shares = ERRORS * np.array([one.stderr for one in misfits]) / size
+    worst = misfits[int(np.argmax(shares.max(axis=1)))]
+    blinded = [f"{name} by {part:.0%}" for name, part in zip(names, shares.max(axis=0), strict=True) if part > SHARE]
+    said = [_unnoticed_delay(misfits, size, kinds)]
+    said += [f"{what(worst.group)}, say, could move {', '.join(blinded)} unnoticed"] if blinded else []
+    return f"this motion cannot show everything: {'; '.join(filter(None, said))}" if any(said) else ""
+
+
+def _unnoticed_delay(misfits: Sequence[Misfit], size: Numbers, kinds: Sequence[str]) -> str:
+    """The longest delay that every second record would not show, of the joint that shows it least; empty where it moves
+    no parameter by more than `SHARE`.
+
+    To slow motion a spring k in series is a delay of 2 damping / k; it hides stiffness / k of the stiffness.
+    """
+    of, errors = dict(zip(kinds, size, strict=False)), noticed(misfits)
+    late: dict[str, float] = {}
+    for one in misfits:
+        if is_delay(one.group) and owner(one.group) != ROBOT and (errors * one.stderr > SHARE * size).any():
+            column = 1.0 if owner(one.group) else of.get("inertia", np.inf)  # of an arm the torque's own slope
+            late[one.group] = errors * float(one.weights_stderr[0]) / column
+    if not late or not max(late.values()):
         return ""
-    return f"this motion cannot show everything: {what(worst.group)}, say, could move {blinded} unnoticed"
+    group = max(late, key=late.__getitem__)
+    whose = f" of {owner(group)}" if owner(group) else ""
+    text = f"a delay{whose} of up to {1e3 * late[group]:.2g} ms would go unnoticed"
+    if not owner(group) and np.isfinite([of.get(kind, np.inf) for kind in ("damping", "stiffness")]).all():
+        hidden = late[group] * of["stiffness"] / (2 * of["damping"])
+        if hidden > SHARE:
+            text += f", and so would what yields as much and hides up to {hidden:.0%} of the stiffness"
+    return text

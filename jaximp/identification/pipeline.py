@@ -18,6 +18,8 @@ from jaximp.types import AnyArray, Recording, nearest
 
 NOISE = ["estimated", "filtered"]
 """Choices of `WindowSettings.noise`."""
+ESTIMATES = ["generalised", "ordinary"]
+"""Choices of `WindowSettings.estimates`."""
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
@@ -31,8 +33,11 @@ class WindowSettings:
     step: float | None = None
     """From one window to the next [s]; by default a fiftieth of the length."""
     noise: str = "estimated"
-    """Of the torque: `estimated` from what windows leave of it, whatever its colour, for generalised least squares;
-    `filtered` takes it as white before the filters, for ordinary least squares as in the paper."""
+    """Of the torque: `estimated` from what windows leave of it, whatever its colour; `filtered` takes it as white
+    before the filters, for ordinary least squares as in the paper."""
+    estimates: str = "generalised"
+    """How noise that is estimated is used. `generalised` least squares count every frequency as much as its noise
+    allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise."""
     min_velocity: float = 0.0
     """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
 
@@ -79,6 +84,11 @@ class Pipeline:
         return self.once and self.window.noise == "estimated"
 
     @property
+    def ordinary(self) -> bool:
+        """Whether the noise is estimated, but only the standard errors of ordinary least squares use it."""
+        return self.whitens and self.window.estimates == "ordinary"
+
+    @property
     def window_samples(self) -> int:
         """Samples of a window before decimation."""
         return round(self.window.length * self.sample_rate)
@@ -121,6 +131,9 @@ class Pipeline:
             )
         if self.window.noise not in NOISE:
             raise ValueError(f"window.noise is '{self.window.noise}': {nearest(self.window.noise, NOISE)}")
+        if self.window.estimates not in ESTIMATES:
+            hint = nearest(self.window.estimates, ESTIMATES)
+            raise ValueError(f"window.estimates is '{self.window.estimates}': {hint}")
         design_filters(self.filter, self.sample_rate)
         if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
             _check_elbow(recording)

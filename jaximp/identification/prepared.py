@@ -22,7 +22,6 @@ from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model
 from jaximp.types import Recording
 
-
 CLEARLY_MORE = 1.5
 """Times the variance of the noise that its samples show."""
 
@@ -157,18 +156,22 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
     recording, pipeline = measured.recording, measured.pipeline
     reference = pipeline.reference_motion(recording)
     white = tuple(whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
-    if len(white) == 1 and white[0].noisy is not None and rows.torque.ndim == 1:
-        white = (with_noise_in_band(rows, white[0]),)
-    if white:
+    times = _noise_in_band(rows, white)
+    if times > CLEARLY_MORE:
+        more, one = np.sqrt(times), white[0]
+        rows, noise = replace(rows, noisy=more * np.asarray(rows.noisy)), more * noise
+        white = (replace(one, noisy=more * np.asarray(one.noisy)),)
+    if white and not pipeline.ordinary:
         noise = np.concatenate([one.column_noise for one in white])
     return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
 
 
-def with_noise_in_band(rows: Rows, white: White) -> White:
-    """With as much noise of the position as is seen inside the band of one joint."""
-    theta = np.linalg.lstsq(white.W[rows.valid], white.torque[rows.valid])[0]
-    times = noise_in_band(rows.W, rows.torque, rows.noisy, rows.valid, theta)
-    return replace(white, noisy=np.sqrt(times) * white.noisy) if times > CLEARLY_MORE else white
+def _noise_in_band(rows: Rows, white: tuple[White, ...]) -> float:
+    """How many times the variance of the noise that its samples show the position has inside the band of one joint."""
+    if len(white) != 1 or white[0].noisy is None or rows.torque.ndim > 1:
+        return 1.0
+    theta = np.linalg.lstsq(white[0].W[rows.valid], white[0].torque[rows.valid])[0]
+    return noise_in_band(rows.W, rows.torque, rows.noisy, rows.valid, theta)
 
 
 def whitened(pipeline: Pipeline, rows: Rows) -> Iterator[White]:

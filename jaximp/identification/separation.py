@@ -16,7 +16,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Num
 
-from jaximp.identification.whitening import White, from_white, with_sizes_of_one
+from jaximp.identification.whitening import White, from_filtered, from_white, with_sizes_of_one
 from jaximp.least_squares.sliding import sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit, least_squares
 from jaximp.types import AnyArray
@@ -153,6 +153,8 @@ class _Slide:
             return ordinary, None
         white = self.whiten(W, y, valid)
         fit = self.plain(jnp.asarray(white.W), jnp.asarray(white.torque), valid=valid)
+        if white.as_filtered is not None:
+            return from_filtered(fit, ordinary, white), white
         return from_white(fit, ordinary, white), white
 
 
@@ -160,7 +162,7 @@ def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: _Sl
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
     fit, white = slide(loaded.human, torque, loaded.valid)
     human, columns = loaded.human, loaded.robot
-    if white is not None:
+    if white is not None and white.as_filtered is None:
         human, columns = jnp.asarray(white.W), jnp.asarray(white.apply(columns, loaded.valid))
     passed_on = _explained_by_the_human(slide.plain, human, columns, loaded.valid)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)

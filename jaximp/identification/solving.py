@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from jaximp.identification.literal import rows_away_from_ends
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows, first_call, on_every_device
-from jaximp.identification.whitening import White, from_white
+from jaximp.identification.whitening import White, from_filtered, from_white
 from jaximp.least_squares.chunks import LONGEST_REACH, finish
 from jaximp.least_squares.chunks import Task as ChunkTask
 from jaximp.least_squares.engine import solve_chunk
@@ -129,8 +129,8 @@ class Solved(NamedTuple):
     unseen: Score
     """How well each window's parameters predict the torque of the window behind it."""
     moments: Moments
-    ordinary: SlidingFit | None = None
-    """Ordinary least squares beside estimates from white rows."""
+    beside: SlidingFit | None = None
+    """Ordinary least squares beside estimates from white rows; or those from white rows, where `fit` is ordinary."""
 
 
 class Layout(NamedTuple):
@@ -143,6 +143,8 @@ class Layout(NamedTuple):
     step: int
     lags: int
     """Lags of the noise's autocovariance, zero for white noise."""
+    ordinary: bool = False
+    """Whether the rows as they were filtered are held against others, and not the white ones."""
 
 
 def make_layout(rows: int, outputs: int, place: Placement, lags: int) -> Layout:
@@ -197,11 +199,15 @@ def solve_stack(several: Sequence[Task], place: Placement, padded: int, stacked:
     first = several[0]
     lags = max((0 if one.noise is None else len(one.noise)) for one in several)
     outputs = int(np.prod(first.rows.torque.shape[1:]))
-    layout = make_layout(padded, outputs, place, lags)
+    layout = make_layout(padded, outputs, place, lags)._replace(ordinary=_ordinary(first.white))
     stack = _stacked(several, place, layout, padded, stacked)
     with first_call("solve", layout, *(x.shape for x in jax.tree.leaves(stack))):
         found = jax.tree.map(np.asarray, _program(layout, stack))
     return [_finished(one, jax.tree.map(lambda x, k=k: x[k], found), place, layout) for k, one in enumerate(several)]
+
+
+def _ordinary(white: White | None) -> bool:
+    return white is not None and white.as_filtered is not None
 
 
 def _stacked(several: Sequence[Task], place: Placement, layout: Layout, padded: int, stacked: int) -> _Stack:
@@ -235,7 +241,8 @@ def _program(layout: Layout, stack: _Stack) -> Any:
 
 
 def _solved(layout: Layout, one: _Stack) -> tuple[Any, Score, Any]:
-    """Fits of all windows of one recording, how they predict, and with white rows ordinary fits and `Held`."""
+    """Fits of all windows of one recording, how they predict, and with white rows ordinary fits and `Held`; or
+    ordinary fits, how they predict, and those of white rows."""
     W, y, valid, plan = one.W, one.y, one.valid, layout.plan
     if plan is None:
         return _solved_one_by_one(layout, one)
@@ -244,6 +251,12 @@ def _solved(layout: Layout, one: _Stack) -> tuple[Any, Score, Any]:
     if one.white is None:
         found = solve_chunk(plan, *_columns(plan, W, y, valid), rows, one.noise, ahead)
         unseen, beside = found.unseen, None
+    elif layout.ordinary:
+        found = solve_chunk(plan, *_columns(plan, W, y, valid), rows, None, ahead)
+        unseen, beside = (
+            found.unseen,
+            solve_chunk(plan._replace(predicts=False), *_columns(plan, *one.white, valid), rows),
+        )
     else:
         found = solve_chunk(plan._replace(predicts=False), *_columns(plan, *one.white, valid), rows)
         predicting = plan._replace(predicts=True)
@@ -262,10 +275,13 @@ def _solved_one_by_one(layout: Layout, one: _Stack) -> tuple[Any, Score, Any]:
     """The same without sums that windows share."""
     W, y, valid = one.W, one.y, one.valid
     slide = partial(sliding_least_squares, window=layout.window, step=layout.step, valid=valid)
-    fit = slide(W, y, noise=one.noise) if one.white is None else slide(*one.white)
+    plain = slide(W, y, noise=one.noise)
+    fit = plain if one.white is None or layout.ordinary else slide(*one.white)
     starts = window_starts(len(W), layout.window, layout.step)
     hold = partial(score, W, y, valid, fit.theta, window=layout.window, step=layout.step)
-    beside = None if one.white is None else (slide(W, y), hold(start=starts))
+    beside: Any = None
+    if one.white is not None:
+        beside = slide(*one.white) if layout.ordinary else (plain, hold(start=starts))
     return fit, hold(start=starts + layout.window), beside
 
 
@@ -286,20 +302,23 @@ def _finished(task: Task, found: Any, place: Placement, layout: Layout) -> Solve
     noise = None if task.noise is None else np.pad(task.noise, (0, layout.lags - len(task.noise)))
     doubtful = np.flatnonzero(fit.doubtful) if isinstance(fit, ChunkFit) else np.zeros(0, int)
     if white is None:
-        fit = _repaired(fit, layout, place, noise, rows.W, rows.torque, rows.valid)
-        ordinary = None
+        fit, beside = _repaired(fit, layout, place, noise, rows.W, rows.torque, rows.valid), None
+    elif layout.ordinary:
+        beside = _repaired(beside, layout, place, None, white.W, white.torque, rows.valid)
+        ordinary = _repaired(fit, layout, place, None, rows.W, rows.torque, rows.valid)
+        fit = from_filtered(beside, ordinary, white)
     else:
         ordinary, seen = _apart(beside)
         ordinary = _repaired(ordinary, layout, place, None, rows.W, rows.torque, rows.valid)
         fit = _repaired(fit, layout, place, None, white.W, white.torque, rows.valid)
         for k in doubtful[np.isfinite(fit.theta[doubtful]).all(axis=1)]:
             seen.vaf[k], seen.residual_rms[k] = _predicted(rows, fit.theta[k], int(starts[k]), place.window)
-        fit = from_white(fit, ordinary, white, seen)
+        fit, beside = from_white(fit, ordinary, white, seen), ordinary
     complete = starts + 2 * place.window <= len(rows.time)
     vaf = np.where(complete & np.isfinite(fit.theta).all(axis=1), unseen.vaf, np.nan)
     for k in doubtful[np.isfinite(vaf[doubtful])]:
         vaf[k] = _predicted(rows, fit.theta[k], int(starts[k]) + place.window, place.window)[0]
-    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[3], ordinary)
+    return Solved(fit, eqx.tree_at(lambda score: score.vaf, unseen, vaf), found[3], beside)
 
 
 def _apart(beside: Any) -> tuple[Any, Score]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,6 +22,8 @@ SLOW = 0.3
 """Velocity below which dry friction builds up, as a share of its root mean square."""
 YIELDING = (0.01, 0.04)
 """Time constants of what yields between the position and the torque [s]."""
+PLAYS = (0.1, 0.25, 0.6)
+"""Half widths of plays, as shares of the root mean square of the motion."""
 WIDEST_BAND = 0.9
 """Of derivatives of rows, as a share of half their rate."""
 
@@ -69,6 +72,23 @@ def yielding(x: Numbers, seconds: float, rate: float) -> Numbers:
     return np.asarray(lfilter([1 - a], [1, -a], x))
 
 
+def behind_play(q: Numbers, half: float) -> Numbers:
+    """What follows q through a play of so much to either side: the play operator, at first in its middle.
+
+    From one turning point of q to the next it is q less the play on the way up, q plus the play on the way down, or
+    what it was at the turning point, whichever lies farther on the way.
+
+    **Source:** Krasnosel'skii and Pokrovskii 1989, Systems with hysteresis.
+    """
+    found, last = np.empty_like(q), q[0]
+    behind_turns = np.flatnonzero(np.diff(np.sign(np.diff(q)))) + 2
+    for first, end in pairwise([0, *behind_turns.tolist(), len(q)]):
+        up = q[end - 1] >= q[max(first - 1, 0)]
+        found[first:end] = np.maximum(last, q[first:end] - half) if up else np.minimum(last, q[first:end] + half)
+        last = found[end - 1]
+    return found
+
+
 SUSPECTS: Mapping[str, Suspect] = {
     "reflex": Suspect(
         "a stretch reflex",
@@ -89,13 +109,18 @@ SUSPECTS: Mapping[str, Suspect] = {
         "model it (coulomb), or leave out slow samples (window.min_velocity)",
         lambda m: [np.sign(m.dq), np.tanh(m.dq / (SLOW * np.sqrt(np.mean(m.dq**2)) + 1e-300))],
     ),
+    "play": Suspect(
+        "play (backlash) between position and torque",
+        "take the play out of the drive or the cuff, or measure the position behind it",
+        lambda m: [behind_play(m.q, share * float(np.std(m.q))) - m.q for share in PLAYS],
+    ),
     "delay": Suspect(
         "a delay between torque and position",
         "check the clocks and filters of both channels",
         lambda m: [m.jerk],
     ),
     "lag": Suspect(
-        "something that yields or filters between position and torque (a cuff, an amplifier)",
+        "something that yields or filters between position and torque (a cuff, an amplifier), or noise of the position",
         "measure the position where the torque acts, and use one filter for both channels",
         lambda m: [m.snap, *(yielding(m.ddq, seconds, m.rate) for seconds in YIELDING)],
     ),
@@ -142,13 +167,14 @@ OF_JOINTS: Mapping[str, Suspect] = {
     "friction": _reworded(
         "friction", "model it (coulomb = true), or leave out more slow samples (window.min_velocity)"
     ),
+    "play": SUSPECTS["play"],
     "viscous": Suspect("viscous friction", "model it (viscous = true)", lambda m: [m.dq]),
     "rotor": Suspect("a motor's inertia", "model it (rotor = true), and leave out lengths", lambda m: [m.ddq]),
     "offset": Suspect("a constant torque", "model it (offset = true)", lambda m: [np.ones_like(m.t)]),
     "drift": SUSPECTS["drift"],
 }
 """Who is asked of each joint of an arm; its column acts on the torque of this joint alone."""
-OF_MUSCLES = ("reflex", "stiffness")
+OF_MUSCLES = ("reflex", "stiffness", "play")
 """Who is asked where joints have muscles, as a model with stiffness says."""
 OF_TORQUES: Mapping[str, OfTorque] = {
     name: OfTorque(SUSPECTS[name].what, SUSPECTS[name].remedy, columns)
@@ -187,6 +213,11 @@ def untagged(group: str) -> tuple[str, int | None]:
     return name, int(whose.split()[-1]) - 1 if whose.startswith("joint") else None
 
 
+def owner(group: str) -> str:
+    """Whose a group is: `joint 2`, `robot`, or nobody's where there is one joint."""
+    return group.rpartition(": ")[0]
+
+
 def what(group: str) -> str:
     """What a group stands for, in words: `dry friction of joint 2`."""
     whose, _, name = group.rpartition(": ")
@@ -209,12 +240,14 @@ def has_muscles(model: Model) -> bool:
 
 
 def of_one_joint(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, Numbers]]:
-    """Columns (N, g) of all `SUSPECTS`, behind the filters."""
+    """Columns (N, g) of all `SUSPECTS` that a joint like the model's may have, behind the filters."""
     (motion,) = motions(pipeline, recording)
-    by_group = [suspect.columns(motion) for suspect in SUSPECTS.values()]
+    muscles = has_muscles(pipeline.model)
+    asked = {name: one for name, one in SUSPECTS.items() if muscles or name not in OF_MUSCLES}
+    by_group = [suspect.columns(motion) for suspect in asked.values()]
     together = behind_filters(pipeline.filters, [column for group in by_group for column in group])
     ends = np.cumsum([len(group) for group in by_group])
-    yield from zip(SUSPECTS, np.split(together, ends[:-1], axis=1), strict=True)
+    yield from zip(asked, np.split(together, ends[:-1], axis=1), strict=True)
 
 
 def of_arm(

@@ -5,7 +5,7 @@ The estimates come from white rows; how well they explain the torque is asked of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
-from jaximp.least_squares.autoregression import Autoregression, autoregression_of, fit_window_noise, whiten_rows
+from jaximp.least_squares.autoregression import (
+    Autoregression,
+    autoregression_of,
+    density_of,
+    fit_window_noise,
+    whiten_rows,
+)
 from jaximp.least_squares.disjoint import DisjointFit, fit_disjoint
 from jaximp.least_squares.sliding import Score
 from jaximp.least_squares.window import SlidingFit, WindowFit
@@ -28,6 +34,8 @@ FREQUENCIES = 256
 """Of a spectrum that is shown."""
 FEWEST_ROWS = 200
 """Independent rows of all windows from which a scatter of their scores is judged."""
+AT_ONCE = 1 << 20
+"""Numbers of windows' columns that are worked on at once."""
 LEAST_LEFT = 1e-3
 """A row's residual is taken for such a share of its error at least, however much of it the parameters took."""
 
@@ -52,6 +60,8 @@ class White:
     """Least squares of the white rows in windows side by side, of all outputs together."""
     inflation: Numbers
     """(p,) by what standard errors grow since the noise's size follows the motion; one where it does not."""
+    as_filtered: AnyArray | None = None
+    """(N, *n, p) columns of the rows as they were filtered, where estimates come from these (`Pipeline.ordinary`)."""
 
     @property
     def every(self) -> int:
@@ -76,6 +86,19 @@ class White:
         for noise, size in zip(self.noise, variance, strict=True):
             shape = of_filters * noise.spectrum(frequency, row_rate)
             found.append(shape * size / (shape.sum() * frequency[1]))
+        return np.stack(found)
+
+    def autocovariance(self, lags: int) -> Numbers:
+        """(n, lags) of each output's noise as it was filtered, by lag in rows, where white rows have unit variance.
+
+        Between rows that say something new the noise is as smooth as its low-pass: nothing is above half their rate.
+        """
+        found = []
+        for noise, size in zip(self.noise, self.size, strict=True):
+            density = size**2 * density_of([self.filtered, noise], -(-lags // self.every))
+            wide = np.zeros((len(density) - 1) * self.every + 1)
+            wide[: len(density)] = density
+            found.append(self.every * np.fft.irfft(wide)[:lags])
         return np.stack(found)
 
     def apply(self, columns: AnyArray, valid: AnyArray, output: int = -1) -> NDArray[np.float64]:
@@ -123,6 +146,7 @@ def whiten(pipeline: Pipeline, rows: Rows) -> White:
         size=size,
         windows=windows,
         inflation=_inflation(flat[0], windows, every),
+        as_filtered=np.where(valid.reshape(shape)[..., None], rows.W, 0) if pipeline.ordinary else None,
     )
 
 
@@ -139,8 +163,11 @@ def _sizes(W: Numbers, y: Numbers, valid: NDArray[np.bool_], window: int) -> Num
     return np.where(size > 0, size, 1) / (size[0] if size[0] > 0 else 1)
 
 
-def _inflation(W: Numbers, windows: DisjointFit, every: int) -> Numbers:
+def _inflation(W: Numbers, windows: DisjointFit, every: int, shares: Callable[[int], Numbers] | None = None) -> Numbers:
     """(p,) root of the variance that the scatter of scores gives over the textbook's, of windows side by side.
+
+    **Arguments:** `W` (N, p) white columns; `shares` of a window, (S, p) by which each row counts in the estimates,
+    where these are not those of the white rows.
 
     **Source:** White 1980; residuals scaled by their leverage, MacKinnon and White 1985 (HC2).
     """
@@ -148,12 +175,12 @@ def _inflation(W: Numbers, windows: DisjointFit, every: int) -> Numbers:
     ratios, chosen = [], np.flatnonzero(windows.sound & (windows.rows >= (p + 2) * every))
     if freedom[chosen].sum() / every < FEWEST_ROWS:
         return np.ones(p)
-    for k in chosen:
-        Q, residual, inverse = windows.orthonormal(W, slice(k, k + 1))[0], windows.residual[k], windows.inverse[k]
-        scores = Q * (residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT)))[:, None]
-        robust = (inverse @ (scores.T @ scores) * inverse).sum(axis=1)
-        plain = (inverse**2).sum(axis=1) * (residual @ residual) / freedom[k]
-        ratios.append(robust / plain)
+    for k in chosen.tolist():
+        Q, residual = windows.orthonormal(W, slice(k, k + 1))[0], windows.residual[k]
+        share = Q @ windows.inverse[k].T if shares is None else shares(k)
+        error = residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT))
+        plain = (share**2).sum(axis=0) * (residual @ residual) / freedom[k]
+        ratios.append(((share * error[:, None]) ** 2).sum(axis=0) / plain)
     return np.sqrt(np.average(ratios, axis=0, weights=freedom[chosen]))
 
 
@@ -174,6 +201,79 @@ def from_white(fit: SlidingFit, ordinary: SlidingFit, white: White, seen: Score 
         theta=fit.theta, stderr=stderr, dof=dof, cond=cond, sigma_min=sigma_min, excitation=fit.excitation,
         residual_rms=rms, vaf=vaf, samples=fit.samples, first=fit.first, last=fit.last,
     )  # fmt: skip
+
+
+def from_filtered(fit: SlidingFit, ordinary: SlidingFit, white: White, columns: AnyArray | None = None) -> SlidingFit:
+    """Ordinary estimates of the rows as they were filtered, with errors that know the noise.
+
+    Its shape comes from the whole record, its size from what is left of the window's white rows.
+
+    **Arguments:** `fit` of the white rows with the textbook's errors; `ordinary` of the others; their `columns`
+    (N, *n, p), if these are not `white.as_filtered` (the noise's size is then taken as the same for all motion).
+    """
+    freedom = np.maximum(np.asarray(fit.samples) - white.every * fit.theta.shape[1], 0)
+    squares = np.asarray(fit.residual_rms) ** 2 * np.asarray(fit.samples)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.where(freedom > 0, np.sqrt(squares / freedom), np.nan)
+    inflation = np.ones(1) if columns is not None else ordinary_inflation(white)
+    columns = np.asarray(white.as_filtered if columns is None else columns)
+    window = int(fit.last[0] - fit.first[0]) + 1 if len(fit.first) else 0
+    solved = np.isfinite(np.asarray(ordinary.theta)).all(axis=1)
+    stderr = ordinary_errors(columns, np.asarray(fit.first)[solved], window, white.autocovariance(window))
+    errors = np.full(ordinary.theta.shape, np.nan)
+    errors[solved] = stderr * size[solved, None] * inflation
+    dof = np.where(solved, freedom / white.every, np.nan)
+    return eqx.tree_at(lambda f: (f.stderr, f.dof), ordinary, (errors, dof))
+
+
+def ordinary_errors(W: AnyArray, starts: NDArray[np.int64], window: int, autocovariance: Numbers) -> Numbers:
+    """(M, p) standard errors of ordinary least squares in windows of rows, `root(diag(A S A'))` with A the
+    pseudo-inverse of the columns and S the covariance of stationary noise.
+
+    **Arguments:** `W` (N, *n, p), zero in rows that do not count; `starts` (M,) of windows with independent columns;
+    `autocovariance` (n, window) of each output's noise, by lag in rows.
+    """
+    from scipy.fft import next_fast_len
+
+    W = W.reshape(len(W), -1, W.shape[-1])
+    _, outputs, p = W.shape
+    circle = next_fast_len(2 * window, real=True)
+    lags = np.zeros((outputs, circle))
+    lags[:, :window], lags[:, circle - window + 1 :] = autocovariance, autocovariance[:, :0:-1]
+    density = np.fft.rfft(lags).real.T / circle
+    density[1 : (circle + 1) // 2] *= 2  # most frequencies stand for their negative too
+    found, around = [np.zeros((0, p))], np.arange(window)
+    for some in np.array_split(starts, 1 + len(starts) * window * outputs * p // AT_ONCE):
+        columns = W[some[:, None] + around]
+        Q, R = np.linalg.qr(columns.reshape(len(some), window * outputs, p))
+        answers = (Q @ np.linalg.inv(R).swapaxes(1, 2)).reshape(columns.shape)
+        power = np.abs(np.fft.rfft(answers, circle, axis=1)) ** 2
+        found.append(np.sqrt(np.einsum("mfjp,fj->mp", power, density)))
+    return np.concatenate(found)
+
+
+def ordinary_inflation(white: White) -> Numbers:
+    """(p,) as `White.inflation`, of ordinary least squares: by what every white row adds to the estimates."""
+    from scipy.signal import lfilter
+
+    W, windows = np.asarray(white.as_filtered), white.windows
+    W = W.reshape(len(W), -1, W.shape[-1])
+    outputs, p = W.shape[1:]
+    size = windows.residual.shape[1]
+    own = fit_disjoint(W.reshape(-1, p), np.zeros(W.size // p), np.ones(W.size // p, bool), size)
+    columns = np.asarray(white.W).reshape(-1, p)
+
+    def shares(k: int) -> Numbers:
+        answers = (own.orthonormal(W.reshape(-1, p), slice(k, k + 1))[0] @ own.inverse[k].T).reshape(-1, outputs, p)
+        for j, noise in enumerate(white.noise):
+            for one in (white.filtered, noise):
+                back = np.zeros(one.order * one.every + 1)
+                back[:: one.every] = one.polynomial
+                answers[:, j] = lfilter([1.0], back, answers[::-1, j], axis=0)[::-1]
+            answers[:, j] *= white.size[j]
+        return answers.reshape(-1, p)
+
+    return _inflation(columns, windows, white.every, shares)
 
 
 def with_sizes_of_one(fit: WindowFit, white: White) -> WindowFit:

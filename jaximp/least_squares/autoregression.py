@@ -11,8 +11,9 @@ judge by frequencies that it took away. So it looks back in steps of `every` row
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,9 @@ WORSE = 6.0
 """How much worse the criterion may become before no higher order is tried."""
 ROWS_PER_TERM = 4
 """A window has so many independent rows for each term of the autoregression, at least."""
+ENOUGH, JOINED, MOST_COLUMNS = 16, 32, 28
+"""Windows that are too short to tell an order that is enough for most noise are looked at several in a row: as many as
+tell the highest one, up to so many parameters of all."""
 FEWEST_WINDOWS = 20
 """Independent rows of all windows together, for each term."""
 LOST = 1e-10
@@ -44,6 +48,8 @@ SETTLED = 1e-5
 ROUNDING = 1e-15
 """Of sums of products: so much is left of a column at least where a long step of the search goes to noise that takes it
 away."""
+SLOWEST, FORGOTTEN = 0.9999, 1e-11
+"""Root of the slowest noise whose density is resolved, and the share of noise that counts as forgotten."""
 NEARLY_ONE, FARTHEST_START = 1 - 1e-9, 0.9999
 """Largest reflection coefficient, and that from which a longer autoregression is searched."""
 
@@ -86,6 +92,16 @@ class Autoregression:
             else:
                 r.append(float(-a[1:] @ np.array(r[: -self.order - 1 : -1])))
         return np.array(r)
+
+
+def density_of(several: Sequence[Autoregression], lags: int) -> Numbers:
+    """(F,) spectral density of noise which autoregressions, one after the other, turn into white noise of unit
+    variance: at even steps from zero to half a cycle per term, so fine that its inverse transform is right at so many
+    lags."""
+    polynomial = reduce(np.convolve, (one.polynomial for one in several), np.ones(1))
+    root = min(SLOWEST, np.abs(np.roots(polynomial)).max(initial=0.5))
+    memory = 2 * lags + np.log(FORGOTTEN) / np.log(root)
+    return np.asarray(1 / np.abs(np.fft.rfft(polynomial, 1 << int(np.ceil(np.log2(memory))))) ** 2)
 
 
 def autoregression_of(autocovariance: Num[AnyArray, " L"], every: int = 1) -> Autoregression:
@@ -145,6 +161,7 @@ def fit_window_noise(
     **Source:** restricted likelihood: Patterson and Thompson 1971; the exact likelihood of an autoregression as a
     quadratic form: Box, Jenkins and Reinsel, Time series analysis, appendix A7.5.
     """
+    W, window = _joined(np.asarray(W), window, every)
     stretches = _stretches(np.asarray(valid, bool), window, every)
     parameters = W.shape[-1]
     rows = sum(sum(len(run) for run in runs) for runs in stretches) / every
@@ -166,6 +183,21 @@ def fit_window_noise(
             break
         best = min(best, (criterion, start), key=lambda one: one[0])
     return Autoregression(best[1], every)
+
+
+def _joined(W: Numbers, window: int, every: int) -> tuple[Numbers, int]:
+    """Columns and rows of windows that are long enough to tell the noise: where they are not, of several in a row, each
+    with parameters of its own."""
+    n, p = W.shape
+    told = window / every - p
+    if not p or not 0 < told < ROWS_PER_TERM * ENOUGH:
+        return W, window
+    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, n // window)
+    if count < 2:
+        return W, window
+    apart = np.zeros((n, count, p))
+    apart[np.arange(n), np.arange(n) // window % count] = W
+    return apart.reshape(n, -1), count * window
 
 
 def whiten_rows(

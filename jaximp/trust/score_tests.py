@@ -49,6 +49,8 @@ class Misfit:
     """(p,) by how much the parameters would change, on the mean over the windows, if the columns were in the model."""
     stderr: Numbers
     """(p,) of that."""
+    weights_stderr: Numbers
+    """(g,)"""
 
 
 class _Sums(NamedTuple):
@@ -75,12 +77,14 @@ def score_groups(
     window: int,
     every: int = 1,
     fit: DisjointFit | None = None,
+    moved_in: tuple[Numbers, Mapping[str, Numbers]] | None = None,
 ) -> list[Misfit]:
     """Test every group of added columns.
 
     **Arguments:** `W` (N, p) and `y` (N,) rows whose noise is white; `groups` of further columns (N, g) that went
     through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one;
-    `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns.
+    `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns;
+    `moved_in` columns (N, p) and groups in rows by which the parameters move, where these are not the white ones.
 
     **Source:** score test with a covariance that knows nothing of the noise's size row by row (White 1980; residuals
     scaled by their leverage).
@@ -90,6 +94,10 @@ def score_groups(
         groups = {name: np.where(valid[:, None], columns, 0) for name, columns in groups.items()}
         fit = fit_disjoint(W, y, valid, window)
     sums = _sums(W, list(groups.values()), fit, every)
+    if moved_in is not None:
+        columns, others = moved_in
+        passed = _passed(columns, [others[name] for name in groups], window, with_say(fit, every))
+        sums = sums._replace(passed=passed)
     found, first = [], 0
     for name, columns in groups.items():
         own = slice(first, first := first + columns.shape[1])
@@ -129,6 +137,14 @@ def _sums(W: Numbers, groups: Sequence[Numbers], fit: DisjointFit, every: int) -
     return _Sums(gram, spread, score, passed, np.sqrt(size), float(freedom.sum()))
 
 
+def _passed(W: Numbers, groups: Sequence[Numbers], window: int, chosen: NDArray[np.int64]) -> Numbers:
+    """(p, G) what each column adds to the parameters by least squares of these rows, on the mean over some windows."""
+    z = np.concatenate(groups, axis=1)
+    parts = [slice(k * window, (k + 1) * window) for k in chosen.tolist()]
+    found = [np.linalg.lstsq(W[part], z[part])[0] for part in parts]
+    return np.mean(found, axis=0) if found else np.zeros((W.shape[1], z.shape[1]))
+
+
 def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
     from scipy.special import fdtrc
 
@@ -152,6 +168,7 @@ def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
         weights=kept @ weights / size,
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),
+        weights_stderr=np.sqrt(np.einsum("ij,jk,ik->i", kept, covariance, kept)) / size,
     )
 
 
@@ -205,6 +222,13 @@ def significant(tests: Sequence[Misfit], level: float = FAMILYWISE) -> list[Misf
             break
         found.append(one)
     return sorted(found, key=lambda one: -one.evidence)
+
+
+def noticed(tests: Sequence[Misfit], level: float = FAMILYWISE) -> float:
+    """How many of its errors large the weight of a single column is that every second record shows."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(level / 2 / len(tests)))
 
 
 def p_in_words(p: float) -> str:

@@ -22,7 +22,7 @@ from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import in_windows, solve_windows
 from jaximp.identification.prepared import Prepared, columns_by_joint, prepare, share_of_stack
 from jaximp.identification.solving import Solved, place_windows
-from jaximp.identification.whitening import from_white
+from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.jobs.job import Job, parse_job
 from jaximp.jobs.run import identify_recording
 from jaximp.least_squares.sliding import Score, score, sliding_least_squares
@@ -69,6 +69,7 @@ CASES = {
     "a still stretch": ([still(joint(1321, 5), slice(500, 1000))], "", ""),
     "slow samples": ([joint(1321, 6)], "step = 0.05", "step = 0.05\nmin_velocity = 0.3"),
     "two joints": ([beside(joint(1321, 8), joint(1321, 9))], "", ""),
+    "ordinary": ([spoilt(joint(1321, 10), slice(600, 700))], "step = 0.05", "step = 0.05\nestimates = 'ordinary'"),
     "robot": ([joint(1321, 12)], "human = true", "robot = { gravity = true, offset = true }"),
 }
 
@@ -104,7 +105,7 @@ def test_windows_of_a_stack_are_those_that_are_decomposed_one_by_one(case: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["slow samples", "two joints"])
+@pytest.mark.parametrize("case", ["slow samples", "two joints", "ordinary"])
 def test_white_rows_of_a_stack_are_solved_as_one_by_one(case: str) -> None:
     recordings, old, new = CASES[case]
     prepared = stacked(parse_job(JOB.replace(old, new) if old else JOB), recordings[:1], 1400, 2)[0]
@@ -118,8 +119,11 @@ def test_white_rows_of_a_stack_are_solved_as_one_by_one(case: str) -> None:
         place = place_windows(prepared.pipeline, rows)
         slide = partial(sliding_least_squares, window=place.window, step=place.step, valid=rows.valid)
         hold = partial(score, rows.W, rows.torque, rows.valid, window=place.window, step=place.step)
-        fit = slide(white.W, white.torque)
-        fit = from_white(fit, slide(rows.W, rows.torque), white, hold(fit.theta, start=place.starts))
+        fit, ordinary = slide(white.W, white.torque), slide(rows.W, rows.torque)
+        if prepared.pipeline.ordinary:
+            fit = from_filtered(fit, ordinary, white)
+        else:
+            fit = from_white(fit, ordinary, white, hold(fit.theta, start=place.starts))
         assert_near(found, fit, hold(fit.theta, start=place.next_starts), trusted)
 
 

@@ -135,7 +135,10 @@ def test_beside_a_slow_drift_noise_of_the_position_is_named_and_the_remedy_helps
     mended = drifting(position_cutoff=5.0)
     assert np.abs(biased(estimates))[[0, 2]].min() > 3
     assert np.abs(biased(mended)).max() < 2
-    assert set(mended.undetermined()) >= {"inertia", "stiffness"}
+    # Few windows can be trusted in the stiffness, those where it comes out large: all of them are asked.
+    relative = np.median(mended.stderr, axis=0) / np.abs(mended.value.mean(axis=0))
+    assert relative[[0, 2]].min() > 2 * mended.limits.max_relative_stderr
+    assert "inertia" in mended.undetermined()
     assert "damping" not in mended.undetermined()
 
 

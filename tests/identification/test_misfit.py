@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
-from jaximp.identification.misfit import harmless, in_words, off_by
+from jaximp.identification.misfit import harmless, in_words, off_by, unnoticed
 from jaximp.trust.score_tests import FAMILYWISE, Misfit, significant
 from jaximp.trust.window_rules import NOTHING_MISSING
 
@@ -62,8 +63,9 @@ def changes(ankles: ModuleType, estimates: Sequence[Estimates], name: str) -> tu
         ("Coulomb friction, 0.3 N m", "dry friction", "damping", "stiffness"),
         ("torque 5 ms late", "a delay between torque and position", "inertia", "stiffness"),
         ("cubic stiffness, +30 %", "a stiffness that depends on the angle", "stiffness", "damping"),
+        ("backlash of 0.02 rad", "play (backlash) between position and torque", "damping", ""),
     ],
-    ids=["reflex", "friction", "delay", "cubic"],
+    ids=["reflex", "friction", "delay", "cubic", "backlash"],
 )
 def test_what_is_missing_is_found_and_named(ankles: ModuleType, wrong: str, words: str, off: str, spared: str) -> None:
     estimates = identified(ankles, wrong)
@@ -96,7 +98,7 @@ def test_good_records_pass(ankles: ModuleType) -> None:
 
 
 def found(group: str, move: list[float], stderr: list[float], evidence: float = 100.0) -> Misfit:
-    return Misfit(group, 1e-12, evidence + 10, evidence, np.ones(1), np.array(move), np.array(stderr))
+    return Misfit(group, 1e-12, evidence + 10, evidence, np.ones(1), np.array(move), np.array(stderr), np.ones(1))
 
 
 NAMED = ["inertia", "damping", "stiffness"], np.ones(3), ["inertia", "damping", "stiffness"]
@@ -111,6 +113,31 @@ def test_what_yields_hides_how_stiff_the_joint_is() -> None:
     assert in_words([lag], off).endswith("inertia would change by +14%, how far stiffness would change cannot be told")
     late = found("delay", [0.14, -0.01, 0.0], [0.01, 0.001, 0.0], evidence=110)
     assert "stiffness" not in off_by([lag, late], *NAMED)
+
+
+def test_the_delay_that_would_go_unnoticed_is_said_with_what_yields_as_much() -> None:
+    kinds = ["inertia", "damping", "stiffness"]
+    size = np.array([0.015, 0.7, 60.0])
+    late = found("delay", [0.0, 0.0, 0.0], [0.001, 0.05, 0.0])
+    late = replace(late, weights_stderr=np.array([0.015 * 1e-3]))  # 1 ms
+    text = unnoticed([late], kinds, size, kinds)
+    # one test at the level of 1 %: half of the records show what is 2.58 errors large
+    assert "a delay of up to 2.6 ms would go unnoticed" in text
+    assert "hides up to 11% of the stiffness" in text  # K d / 2B
+    assert "damping by 14%" in text
+    fine = replace(late, stderr=late.stderr / 100, weights_stderr=late.weights_stderr / 100)
+    assert unnoticed([fine], kinds, size, kinds) == ""
+    arms = replace(late, group="joint 2: delay", weights_stderr=np.array([1e-3]))
+    assert "a delay of joint 2 of up to 2.6 ms would go unnoticed; " in unnoticed([arms], kinds, size, kinds)
+    robots = replace(late, group="robot: delay")
+    assert "would go" not in unnoticed([robots], kinds, size, kinds)
+
+
+def test_weights_of_a_reflex_are_not_named_one_by_one() -> None:
+    names = ["inertia", "weight at 0.04 s", "weight at 0.07 s"]
+    lag = found("lag", [0.0, 0.0, 0.0], [0.1, 5.0, 5.0])
+    text = unnoticed([lag], names, np.ones(3), spared=set(names[1:]))
+    assert text.endswith("could move inertia by 20% unnoticed")
 
 
 def test_a_move_that_is_not_determined_spares_nothing() -> None:

@@ -145,6 +145,20 @@ def test_a_change_of_the_parameters_is_no_noise() -> None:
     assert fit_window_noise(W, y, np.ones(4000, bool), 4000 // 20 * 19).order > 0
 
 
+def test_short_windows_tell_noise_of_a_high_order_though_each_has_parameters_of_its_own() -> None:
+    """A tremor takes more terms than a window of 25 rows can tell."""
+    noise = Autoregression(np.array([-0.25, 0.9, -0.2, 0.85, 0.1, 0.5, 0.3, -0.4, 0.2, 0.3]))
+    generator, window, n = np.random.default_rng(12), 25, 5000
+    W = generator.normal(size=(n, 3))
+    theta = np.repeat(10 * generator.normal(size=(n // window, 3)), window, axis=0)
+    y = (W * theta).sum(axis=1) + sample(noise, n, generator)
+    found = fit_window_noise(W, y, np.ones(n, bool), window)
+    assert found.order >= noise.order
+    f = np.linspace(0, 0.5, 200)
+    ratio = found.spectrum(f, 1.0) / noise.spectrum(f, 1.0)
+    assert np.exp(np.abs(np.log(ratio)).mean()) < 1.3
+
+
 def test_white_noise_and_few_rows_need_no_autoregression() -> None:
     generator = np.random.default_rng(8)
     W, _ = rows(60, seed=9)

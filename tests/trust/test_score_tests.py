@@ -107,7 +107,7 @@ def test_a_window_that_hardly_moves_has_no_say() -> None:
 
 def misfit(group: str, p: float, evidence: float = 0.0) -> Misfit:
     nothing = np.zeros(1)
-    return Misfit(group, p, 0.0, evidence, nothing, nothing, nothing)
+    return Misfit(group, p, 0.0, evidence, nothing, nothing, nothing, nothing)
 
 
 @pytest.mark.parametrize(
