@@ -7,7 +7,7 @@ Shapes, everywhere in jaximp: time is axis 0. `N` samples, `M` windows, `S` samp
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,8 +67,12 @@ class Recording:
     command: NDArray[np.float64] | None = None
     """(N, n) perturbing torque (or force) that was commanded, zero before and after the perturbation."""
     position_noise: NDArray[np.float64] | None = None
-    """(n,) standard deviation of the white noise of each position, as it was seen before anything was resampled, or as
-    it was stated; None where nobody has looked."""
+    """(n,) standard deviation of the white noise of each position, as it was seen before anything was resampled; None
+    where nobody has looked."""
+    stated_noise: NDArray[np.float64] | None = None
+    """(n,) standard deviation of the sensor of each position, where it was stated; samples may not show all of it."""
+    delay_unknown: bool = False
+    """Whether the delay of the torque behind the position is to be estimated and taken out."""
     clipped: NDArray[np.bool_] | None = None
     """(N,) True where a torque was cut off at a limit; these samples are not valid."""
     name: str = "recording"
@@ -89,6 +93,19 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def of_joint(self, j: int) -> Recording:
+        """Position and torque of one joint of several, counted from zero."""
+        this = slice(j, j + 1)
+        seen, stated = (None if noise is None else noise[this] for noise in (self.position_noise, self.stated_noise))
+        return replace(
+            self,
+            position=self.position[:, this],
+            torque=self.torque[:, this],
+            joints=self.joints[this],
+            position_noise=seen,
+            stated_noise=stated,
+        )
 
 
 MOST_CHOICES = 50

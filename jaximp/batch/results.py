@@ -26,7 +26,7 @@ from jaximp.batch.plan import Batch, Item, printable
 from jaximp.batch.tables import recordings_table, windows_table
 from jaximp.batch.task import FAILED, About, Result, Task, checksum, file_checksum, input_checksum, job_checksum, load
 from jaximp.identification.identify import in_windows, solve_windows
-from jaximp.identification.prepared import Prepared, prepare, share_of_stack
+from jaximp.identification.prepared import Prepared, prepare, share_of_stack, without_unknown_delay
 from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import WindowJob
@@ -153,10 +153,11 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
                     f"{item.file}: it has {recording.n_joints} joints, but this study {task.joints}: name the columns "
                     "of each joint, or make a study of its own"
                 )
+            pipeline = task.job.pipeline_for(recording)
+            recording = without_unknown_delay(pipeline, recording)
             result.recording, result.about = recording, About.of(recording)
             size = next((size for size in task.sizes if size[0] >= len(recording)), None)
             if batch.padded and size is not None:
-                pipeline = task.job.pipeline_for(recording)
                 pipeline.check(recording)
                 found = measure(pipeline, recording)
                 result.stacked = (*size, _kind_of(found)), found

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import signals
+from jaximp.identification.delays import UNKNOWN, find_delay
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
 from jaximp.identification.judging import jump_note
-from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import jumped, measure, regress
+from jaximp.identification.pipeline import NOISE, Pipeline
+from jaximp.identification.prepared import columns_by_joint, prepare
+from jaximp.identification.regression import jumped, once
 from jaximp.models.base import combine
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import NO_DATA, WEAK
@@ -29,8 +31,8 @@ WIDEST = 2 * np.pi
 """No human joint turns further than this [rad]."""
 MOST_GLITCHES = 1e-3
 """A share of the samples beyond which the recorder should be looked at."""
-LONGEST_DELAY = 0.03
-"""Delays between torque and position are sought up to this long [s]."""
+LONGEST_WINDOW = 5.0
+"""In which the noise is looked for before a window is chosen [s]."""
 
 
 @dataclass(frozen=True)
@@ -116,40 +118,6 @@ def coherent_bandwidth(recording: Recording) -> float:
     return float(max(frequency[max(1, first + length)], 5 * slow))
 
 
-def estimate_delay(pipeline: Pipeline, recording: Recording) -> tuple[float, bool]:
-    """Delay of the torque behind the position [s] at which the model fits best, and whether the data determine it."""
-    robot, model = pipeline.robot, pipeline.model
-    undecimated = replace(
-        pipeline,
-        model=model if robot is None else combine(robot, model),
-        robot=None,
-        filter=replace(pipeline.filter, decimate=1, mode="once"),
-    )
-    rows = regress(measure(undecimated, recording))[0]
-    W, torque = (np.asarray(x).reshape(len(rows.time), recording.n_joints, -1) for x in (rows.W, rows.torque))
-    usable = np.atleast_1d(np.asarray(rows.valid).reshape(len(rows.time), -1).all(axis=1))
-    reach = max(3, round(LONGEST_DELAY * recording.sample_rate))
-    first, last = (np.flatnonzero(usable)[[0, -1]] + [reach, -reach]).tolist()
-    inner = slice(first, last + 1)
-    if last - first < 10 * W.shape[-1] or not usable[inner].any():
-        return 0.0, False
-    keep = usable[inner]
-    Q = np.linalg.qr(W[inner][keep].reshape(-1, W.shape[-1]))[0]
-    unexplained = []
-    for shift in range(-reach, reach + 1):
-        y = torque[first + shift : last + 1 + shift][keep].reshape(-1)
-        unexplained.append((y @ y - (Q.T @ y) @ (Q.T @ y)) / (y @ y))
-    best = int(np.argmin(unexplained))
-    if best in (0, len(unexplained) - 1):
-        return (best - reach) / recording.sample_rate, False
-    before, here, after = unexplained[best - 1 : best + 2]
-    sharp = before - 2 * here + after
-    offset = 0.5 * (before - after) / sharp if sharp > 0 else 0.0
-    # A flat minimum says nothing: two samples beside it must fit visibly worse.
-    determined = min(unexplained[max(best - 2, 0)], unexplained[min(best + 2, 2 * reach)]) > 1.001 * here
-    return float((best - reach + offset) / recording.sample_rate), bool(determined)
-
-
 def _sampling(recording: Recording) -> Finding:
     text = f"{len(recording)} samples at {recording.sample_rate:.6g} Hz, {len(recording) / recording.sample_rate:.4g} s"
     if recording.sample_rate < SLOWEST:
@@ -225,19 +193,25 @@ def _cutoffs(bandwidth: float, recording: Recording) -> tuple[float, float]:
 
 
 def _delay(pipeline: Pipeline, recording: Recording) -> Finding:
-    delay, determined = 0.0, False
+    """Of the torque behind the position; of several joints the one that is surest."""
+    found = []
     with suppress(ValueError):  # which says why no window can be tried either
-        delay, determined = estimate_delay(pipeline, recording)
-    if not determined:
+        model = pipeline.model if pipeline.robot is None else combine(pipeline.robot, pipeline.model)
+        window = replace(pipeline.window, length=min(pipeline.window.length, LONGEST_WINDOW), noise=NOISE[0])
+        own = replace(once(pipeline), model=model, robot=None, window=window)
+        prepared = prepare(own, recording)
+        for place in columns_by_joint(model):
+            rows = prepared.rows if place is None else prepared.rows.of_joint(*place)
+            if rows.torque.ndim == 1:
+                found.append(find_delay(own, rows))
+    best = max(found, key=lambda one: abs(one.seconds) / one.stderr, default=UNKNOWN)
+    if not np.isfinite(best.stderr):
         return Finding("delay", GOOD, "the data do not determine a delay between torque and position")
-    text = f"the model fits best if torque lags position by {1e3 * delay:.2f} ms"
-    if abs(delay) < 0.5 / recording.sample_rate:
-        return Finding("delay", GOOD, f"{text}, within half a sample")
-    return Finding(
-        "delay",
-        LOOK,
-        f"{text} ({delay * recording.sample_rate:.1f} samples): if the recorder did this, shift the torque beforehand",
-    )
+    text = f"the model fits best if the torque {best.in_words()}"
+    if not best.certain or abs(best.seconds) < 0.5 / recording.sample_rate:
+        return Finding("delay", GOOD, text)
+    remedy = f"if the recorder did this, write delay = {best.seconds:.3g} into the torque's table; a cuff looks alike"
+    return Finding("delay", LOOK, f"{text} ({best.seconds * recording.sample_rate:.1f} samples): {remedy}")
 
 
 def _window(

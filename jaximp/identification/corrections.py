@@ -20,6 +20,10 @@ from jaximp.types import AnyArray, Numbers
 
 UNSURE = 0.2
 """What is known of the noise of the position is known to such a share of its variance."""
+DEPENDENT = 1e-12
+"""Smallest eigenvalue of W'W with columns of unit size."""
+SURE = 3.0
+"""A window tells how another changes if none of its standard errors is so many times larger."""
 LEAST_LEFT = 0.5
 """Where noise makes more than half of a column, to first order nothing can be corrected."""
 
@@ -99,16 +103,25 @@ def corrected(fit: SlidingFit, W: AnyArray, noisy: AnyArray | None, valid: AnyAr
     **Arguments:** rows `W` (N, *n, p) of the `fit`, and what noise of the position makes of them, `noisy` (N, *n, p);
     `valid` (N, *n); windows `apart` of each other share no rows.
     """
+    sums = window_sums(W, valid, fit)
     known = np.isfinite(np.asarray(fit.theta)).all(axis=1) & (np.asarray(fit.stderr) > 0).all(axis=1)
+    known &= _well_conditioned(sums.gram)
     if not known.any():
         return fit
-    sums = window_sums(W, valid, fit)
     theta, stderr = np.array(fit.theta), np.array(fit.stderr)
     if noisy is not None:
         theta[known], stderr[known] = _without_noise(theta[known], stderr[known], _some(sums, known), noisy, valid)
     moved, variance = _without_change(theta, stderr, sums, known, apart, _share_of_distance(fit, apart))
     theta, stderr = theta - moved, np.sqrt(stderr**2 + variance)
     return eqx.tree_at(lambda f: (f.theta, f.stderr), fit, (theta, stderr))
+
+
+def _well_conditioned(gram: Numbers) -> NDArray[np.bool_]:
+    """(M,) whether columns are there and independent, in any units."""
+    size = np.sqrt(np.einsum("kii->ki", gram))
+    there = (size > 0).all(axis=1) & np.isfinite(size).all(axis=1)
+    size = np.where(there[:, None], size, 1)
+    return np.asarray(there & (np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None]))[:, 0] > DEPENDENT))
 
 
 def _share_of_distance(fit: SlidingFit, apart: int) -> float:
@@ -167,8 +180,8 @@ def changes_between(theta: Numbers, stderr: Numbers, known: NDArray[np.bool_], a
     before, after = place - apart, place + apart
     has_before, has_after = before >= 0, after < len(theta)
     before, after = before.clip(0), after.clip(max=len(theta) - 1)
-    has_before &= known[before] & known
-    has_after &= known[after] & known
+    has_before &= known[before] & known & (stderr[before] < SURE * stderr).all(axis=1)
+    has_after &= known[after] & known & (stderr[after] < SURE * stderr).all(axis=1)
     value, square = np.where(known[:, None], theta, 0), np.where(known[:, None], stderr**2, 0)
     earlier, later = value - value[before], value[after] - value
     earlier_square, later_square = square + square[before], square + square[after]

@@ -250,17 +250,25 @@ class Estimates(Result):
 
     def undetermined(self) -> dict[str, float]:
         """Parameters whose standard error in one window is, in the median over those that can be trusted in it, a
-        larger share of their mean than `limits.max_relative_stderr`; and that share.
+        larger share of their size in all windows than `limits.max_relative_stderr`; and that share.
 
         The rules of a window are milder: they compare with what would explain the whole torque by itself.
         """
         found = {}
-        for k, (name, mean) in enumerate(zip(self.names, self.mean_over_trusted(), strict=True)):
-            errors = self.stderr[self.trusted_in(name), k]
-            share = float(np.median(errors) / abs(mean)) if len(errors) and mean else 0.0
+        for k, name in enumerate(self.names):
+            errors, size = self.stderr[self.trusted_in(name), k], self._size(k)
+            share = float(np.median(errors) / size) if len(errors) and size else 0.0
             if share > self.limits.max_relative_stderr:
                 found[name] = share
         return found
+
+    def _size(self, k: int) -> float:
+        """Of a parameter: its mean over all windows, each by how sure it is. Windows that are trusted because it comes
+        out large in them do not speak for it."""
+        value, stderr = self.value[:, k], self.stderr[:, k]
+        known = np.isfinite(value) & (stderr > 0)
+        weight = 1 / stderr[known] ** 2
+        return abs(float((weight * value[known]).sum() / weight.sum())) if known.any() else 0.0
 
     def _trusted_columns(self) -> list[NDArray[np.float64]]:
         return [self.value[self.trusted_in(name), k] for k, name in enumerate(self.names)]

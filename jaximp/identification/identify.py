@@ -197,13 +197,7 @@ def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Pre
     chosen = tuple(name.removeprefix(tag) for name in pipeline.limits.parameters if name.startswith(tag))
     return replace(
         prepared,
-        recording=replace(
-            recording,
-            position=recording.position[:, this],
-            torque=recording.torque[:, this],
-            joints=recording.joints[this],
-            position_noise=None if recording.position_noise is None else recording.position_noise[this],
-        ),
+        recording=recording.of_joint(j),
         pipeline=replace(pipeline, model=model.models[j], limits=pipeline.limits.of_joint(j, parameters=chosen)),
         rows=prepared.rows.of_joint(j, columns),
         column_noise=prepared.column_noise[columns],

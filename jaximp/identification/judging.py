@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.corrections import corrected
+from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
-from jaximp.identification.misfit import by_bands, harmless, in_words, missing, off_by, sizes, unnoticed
+from jaximp.identification.misfit import by_bands, harmless, in_words, is_delay, missing, off_by, sizes, unnoticed
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.regression import Rows
@@ -26,7 +27,7 @@ from jaximp.models.reflex import pathway_of
 from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
-from jaximp.trust.score_tests import Bands, Misfit, compare_bands
+from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
 from jaximp.trust.window_rules import Windows, excited_windows, judge_together, judged_names, measure_windows
 from jaximp.types import Numbers, Recording
 
@@ -72,6 +73,7 @@ def judge(
         why_not,
         _likeness(measured, limits),
         *of_model.notes,
+        _delay(prepared, rows, misfits),
         *notes,
     )
     estimates = Estimates(
@@ -138,6 +140,19 @@ def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limi
     theta, stderr = (np.asarray(x)[:, which] * factor for x in (fit.theta, fit.stderr))
     outside = plausibility.times_outside(theta, stderr, ranges, limits.errors_apart)
     return replace(measured, impedance=theta, outside=outside)
+
+
+def _delay(prepared: Prepared, rows: Rows, misfits: tuple[Misfit, ...]) -> str:
+    """How long a delay is, if what the model lacks is one."""
+    if len(prepared.white) != 1 or not any(is_delay(one.group) for one in significant(misfits)):
+        return ""
+    found = find_delay(prepared.pipeline, rows)
+    if not found.certain:
+        return ""
+    return (
+        f"if what is missing is a delay, the torque {found.in_words()}: delay = {found.seconds:.3g} in the torque's "
+        "table of [recording] takes it out; nothing was moved"
+    )
 
 
 def _likeness(measured: Windows, limits: TrustLimits) -> str:

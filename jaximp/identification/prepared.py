@@ -11,15 +11,17 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp.identification.corrections import noise_in_band
+from jaximp.identification.delays import find_delay
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import RobotTests
-from jaximp.identification.pipeline import Pipeline, ReferenceMotion
+from jaximp.identification.pipeline import NOISE, Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
-from jaximp.models.base import Joints, Model
+from jaximp.models.base import Joints, Model, combine
+from jaximp.recordings.delays import moved_forward
 from jaximp.types import Recording
 
 CLEARLY_MORE = 1.5
@@ -86,6 +88,7 @@ def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
 
 def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = None) -> Prepared:
     """Filter a recording, and that of the robot alone where there is a pair."""
+    recording, alone = without_unknown_delay(pipeline, recording), alone and without_unknown_delay(pipeline, alone)
     if pipeline.robot is not None:
         return _prepare_pair(pipeline, pipeline.robot, recording, alone)
     pipeline.check(recording)
@@ -93,6 +96,28 @@ def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = 
     if pipeline.once:
         return _prepared(measured, *regress(measured))
     return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
+
+
+def without_unknown_delay(pipeline: Pipeline, recording: Recording) -> Recording:
+    """With a torque whose delay is to be estimated moved by what is found, and a note; others as they are.
+
+    **Raises:** `ValueError` for several joints.
+    """
+    if not recording.delay_unknown:
+        return recording
+    if recording.n_joints > 1:
+        raise ValueError('torque: delay = "estimate" works on one joint: give the delay in seconds')
+    model = pipeline.model if pipeline.robot is None else combine(pipeline.robot, pipeline.model)
+    own = replace(once(pipeline), model=model, robot=None, window=replace(pipeline.window, noise=NOISE[0]))
+    as_recorded = replace(recording, delay_unknown=False)
+    prepared = prepare(own, as_recorded)
+    found = find_delay(own, prepared.rows)
+    if not found.certain:
+        note = f"the delay of the torque cannot be told from zero ({found.in_words()}): nothing was moved"
+        return replace(as_recorded, notes=(*recording.notes, note))
+    note = f"the torque {found.in_words()}, as the model finds, and was moved by so much; what yields looks alike"
+    moved = moved_forward(as_recorded, found.seconds)
+    return replace(moved, notes=(*recording.notes, note))
 
 
 def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:

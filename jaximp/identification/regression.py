@@ -107,8 +107,21 @@ def measure(pipeline: Pipeline, recording: Recording, model: Model | None = None
     if levels is None:
         levels = np.array([signals.noise_level(q) for q in motion.position.T])
     jumps = jumped(recording, levels)
+    levels = _with_stated(levels, recording, pipeline.filter.position_cutoff)
     clean = undisturbed(recording, filters, memory=model.memory, jumps=jumps)
     return Measured(recording, pipeline, model, motion, with_noise(motion, levels.tolist()), jumps, clean)
+
+
+def _with_stated(seen: Numbers, recording: Recording, cutoff: float | None) -> Numbers:
+    """(n,) standard deviation of white noise as dense as that of the position inside its filter.
+
+    What is stated and not seen in the samples lies inside the filter's band: where it does most harm.
+    """
+    if recording.stated_noise is None:
+        return seen
+    half = recording.sample_rate / 2
+    hidden = np.maximum(recording.stated_noise**2 - seen**2, 0)
+    return np.sqrt(seen**2 + hidden * half / (half if cutoff is None else min(cutoff, half)))
 
 
 def regress(measured: Measured) -> tuple[Rows, NDArray[np.float64]]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.recordings.channels import Signal, check_lengths
+from jaximp.recordings.delays import without_delay
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import check_stamps, on_uniform_grid
 from jaximp.recordings.raw import judge_raw
@@ -15,27 +16,49 @@ from jaximp.types import Recording
 
 
 def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...], name: str) -> Recording:
-    """Check every channel and bring all of them onto one uniform grid."""
+    """Check every channel, mask what is spoilt, take delays out, and bring all channels onto one uniform grid."""
     _check_shapes(clock, signals, len(joints))
     stamps = clock.values[:, 0]
     check_stamps(clock.labels[0], stamps)
     labels = [label for signal in signals.values() for label in signal.labels]
-    samples = np.hstack([signal.values for signal in signals.values()])
-    valid, notes = _complete_rows(labels, samples)
+    valid, notes = _complete_rows(labels, _side_by_side(signals))
     for channel in ("position", "torque"):
         notes += _check_motion(channel, signals[channel], valid)
     judged = judge_raw(stamps, signals, valid)
-    samples = np.hstack([signal.values for signal in judged.signals.values()])
-    time, samples, valid, sampling_notes = on_uniform_grid(stamps, samples, judged.valid)
+    moved = {channel: without_delay(signal, stamps, judged.valid) for channel, signal in judged.signals.items()}
+    notes += [_moved_in_words(channel, signal.delay) for channel, signal in signals.items() if signal.delay]
+    samples = _side_by_side(moved)
+    usable = judged.valid & np.isfinite(samples).all(axis=1)
+    time, samples, valid, of_sampling = on_uniform_grid(stamps, samples, usable)
     _check_enough(valid)
     samples = np.where(valid[:, None], samples, np.nan)
     borders = np.cumsum([len(signal.labels) for signal in signals.values()])[:-1]
-    channels: dict[str, NDArray[Any]] = dict(zip(signals, np.split(samples, borders, axis=1), strict=True))
-    clipped = np.interp(time, stamps, judged.clipped) > 0.5 if judged.clipped.any() else None
-    whole = {"time": time, "valid": valid, "position_noise": judged.position_noise, "clipped": clipped}
-    arrays = {key: _frozen(array) for key, array in (channels | whole).items() if array is not None}
-    faults = tuple(fault.text for fault in judged.faults)
-    return Recording(**arrays, joints=joints, name=name, notes=(*sampling_notes, *notes, *faults), faults=judged.faults)
+    clipped = None
+    if judged.clipped.any():
+        clipped = _frozen(np.interp(time + (signals["torque"].delay or 0), stamps, judged.clipped) > 0.5)
+    stated = signals["position"].noise
+    return Recording(
+        time=_frozen(time),
+        valid=_frozen(valid),
+        **dict(zip(signals, map(_frozen, np.split(samples, borders, axis=1)), strict=True)),
+        joints=joints,
+        position_noise=_frozen(judged.position_noise),
+        stated_noise=None if stated is None else _frozen(np.full(len(joints), stated)),
+        delay_unknown=signals["torque"].delay is None,
+        clipped=clipped,
+        name=name,
+        notes=(*of_sampling, *notes, *(fault.text for fault in judged.faults)),
+        faults=judged.faults,
+    )
+
+
+def _side_by_side(signals: dict[str, Signal]) -> NDArray[np.float64]:
+    return np.hstack([signal.values for signal in signals.values()])
+
+
+def _moved_in_words(channel: str, delay: float) -> str:
+    late = "late" if delay > 0 else "early"
+    return f"{channel} was recorded {1e3 * abs(delay):.6g} ms {late}, as the mapping says, and was moved by so much"
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -21,6 +21,10 @@ class Signal:
 
     labels: tuple[str, ...]
     values: NDArray[np.float64]
+    delay: float | None = 0.0
+    """How late it was recorded [s]; None where that is to be estimated."""
+    noise: float | None = None
+    """Standard deviation of the sensor's error, where it is stated."""
 
 
 def stack(columns: Sequence[str], values: Mapping[str, Any]) -> Signal:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,10 @@ def load_recording(
       (one per joint), or `{column = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, that of the channel:
       rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N; `reference` is a position, `command` (the
       perturbation) a torque. A bare `gain` multiplies the column and `unit` is that of the product; with
-      `gain = "35.1507 N/V"`, `unit` is that of the column.
+      `gain = "35.1507 N/V"`, `unit` is that of the column. `delay` [s] says how late a channel was recorded, by a
+      filter or another clock: it is moved forward by so much. That of the torque behind the position may be "estimate":
+      the model finds it. `noise`, of the position alone and in its unit, is the standard deviation of its sensor, which
+      samples that a recorder filtered do not show; estimates are corrected for it.
     - `joint`: `revolute` or `prismatic`, or a list of these, one per joint.
     - `gear_ratio`: motor turns per joint turn, if the columns were measured at the motor: position, velocity,
       acceleration and reference are divided by it, torque and command are multiplied; `force` acts at the endpoint and
@@ -149,7 +153,7 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
     for number in in_order:
         rows = numbers == number
         with _named(f"{path}, trial {number:g}"):
-            part = {key: Signal(signal.labels, signal.values[rows]) for key, signal in signals.items()} | scalar
+            part = {key: replace(signal, values=signal.values[rows]) for key, signal in signals.items()} | scalar
             recordings.append(assemble(take_clock(part, rate), part, joints, f"{path.stem}, trial {number:g}"))
     return recordings
 

@@ -14,7 +14,7 @@ from jaximp.recordings.errors import RecordingError
 from jaximp.types import JOINT_TYPES, nearest
 
 Entry = str | Sequence[str] | Mapping[str, Any]
-"""One channel of the mapping: a column, a list of columns, or `{column, unit, sign, gain}`."""
+"""One channel of the mapping: a column, a list of columns, or `{column, unit, sign, gain, delay}`."""
 
 KEYS = ("time", *CHANNELS, "sample_rate", "joint", "gear_ratio", "name")
 """The keys of a mapping, which are the keywords of `load_recording`."""
@@ -29,6 +29,10 @@ class Source:
     sign: float = 1.0
     gain: float | None = None
     gain_unit: str | None = None
+    delay: float | None = 0.0
+    """How late it was recorded [s]; None where that is to be estimated."""
+    noise: float | None = None
+    """Standard deviation of the sensor's error, in `unit`."""
 
 
 def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
@@ -46,7 +50,8 @@ def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
 def source_of(channel: str, entry: Any) -> Source:
     """Check one entry of the mapping. Time and sample rate are a single column with a unit, and no more."""
     options = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
-    allowed = ["column", "unit"] if channel in ("time", "sample_rate") else ["column", "unit", "sign", "gain"]
+    measured = ["sign", "gain", "delay"] if channel not in ("time", "sample_rate") else []
+    allowed = ["column", "unit", *measured, *(["noise"] if channel == "position" else [])]
     for key in options:
         if key == "file":
             raise RecordingError(
@@ -63,7 +68,23 @@ def source_of(channel: str, entry: Any) -> Source:
         raise RecordingError(f'{channel}: the unit must be text such as "deg", not {unit!r}')
     if not is_number(sign) or abs(sign) != 1:
         raise RecordingError(f"{channel}: sign must be 1 or -1, not {sign!r}")
-    return Source(tuple(columns), unit, float(sign), *_gain(channel, options.get("gain")))
+    gain = _gain(channel, options.get("gain"))
+    delay, noise = _delay(channel, options.get("delay", 0.0)), options.get("noise")
+    if noise is not None and not (is_number(noise) and 0 < noise < math.inf):
+        raise RecordingError(f"{channel}: noise must be the sensor's standard deviation, above 0, not {noise!r}")
+    return Source(tuple(columns), unit, float(sign), *gain, delay, noise)
+
+
+def _delay(channel: str, delay: Any) -> float | None:
+    """Seconds, or None for "estimate"."""
+    if delay == "estimate":
+        if channel != "torque":
+            raise RecordingError(f'{channel}: delay = "estimate" is that of the torque behind the position: move it')
+        return None
+    if not is_number(delay) or not math.isfinite(delay):
+        others = ', or "estimate"' if channel == "torque" else ""
+        raise RecordingError(f"{channel}: delay must be a number of seconds{others}, not {delay!r}")
+    return float(delay)
 
 
 def _gain(channel: str, gain: Any) -> tuple[float | None, str | None]:

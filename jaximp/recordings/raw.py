@@ -4,7 +4,7 @@ and told."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ def judge_raw(stamps: Numbers, given: Mapping[str, Signal], valid: NDArray[np.bo
             if spoilt.any():
                 faults.append(_glitches(label, spoilt, stamps))
             kept &= ~spoilt & np.isfinite(values[:, k])
-        found[channel] = Signal(given[channel].labels, values)
+        found[channel] = replace(given[channel], values=values)
     clipped = np.zeros(len(valid), bool)
     positions = np.where(kept[:, None], found["position"].values, np.nan)
     rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])

@@ -40,8 +40,10 @@ def to_si(channel: str, signal: Signal, source: Source, joints: tuple[str, ...],
     units = [si_unit(channel, kind) for kind in kinds]
     factors = [_unit_factor(channel, source, *pair) for pair in zip(signal.labels, units, strict=True)]
     with np.errstate(over="ignore"):
-        values = signal.values * (np.array(factors) * source.sign * (source.gain or 1.0) * gear)
-    return Signal(signal.labels, values)
+        factor = np.array(factors) * source.sign * (source.gain or 1.0) * gear
+        values = signal.values * factor
+    noise = None if source.noise is None else float(source.noise * np.abs(factor).max())
+    return Signal(signal.labels, values, source.delay, noise)
 
 
 def si_unit(channel: str, joint: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factories.joints import JOB, TIME, joint
-from jaximp.identification.check import BAD, LOOK, coherent_bandwidth, estimate_delay
+from jaximp.identification.check import BAD, LOOK, coherent_bandwidth
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import check, identify_recording
 from jaximp.recordings.load import recording_from_arrays
@@ -19,15 +19,6 @@ def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:
     assert set(verdicts.values()) == {"ok"}, findings
     assert 6.3 < proposal.decimation_cutoff < proposal.position_cutoff < 500
     assert proposal.window is not None
-
-
-@pytest.mark.parametrize("samples", [-4, 0, 7])
-def test_delay_is_found(samples: int) -> None:
-    recording = joint()
-    late = replace(recording, torque=np.roll(recording.torque, samples, axis=0))
-    delay, determined = estimate_delay(parse_job(JOB).pipeline_for(late), late)
-    assert determined
-    assert delay == pytest.approx(samples * 1e-3, abs=0.4e-3)
 
 
 @pytest.mark.slow

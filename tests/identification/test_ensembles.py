@@ -91,7 +91,8 @@ def test_a_parameter_that_is_not_determined_is_said_by_name(capsys: pytest.Captu
     assert "inertia" in found
     assert "coulomb_friction" not in found
     k = estimates.names.index("inertia")
-    assert found["inertia"] == pytest.approx(np.median(estimates.stderr[:, k]) / estimates.value[:, k].mean())
+    size = np.average(estimates.value[:, k], weights=1 / estimates.stderr[:, k] ** 2)
+    assert found["inertia"] == pytest.approx(np.median(estimates.stderr[:, k]) / size)
     _say_result(estimates)
     said = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")}
     assert "not determined: its standard error in one window is" in said["inertia"]
@@ -120,8 +121,9 @@ def drifting(position_cutoff: float = 20.0, noise: str = "estimated") -> Estimat
 
 
 def test_beside_a_slow_drift_noise_of_the_position_is_named_and_the_remedy_helps() -> None:
-    """Frequencies without drift count more, where the encoder's noise builds the columns: that biases inertia and
-    stiffness. The reason says so, and a lower cut-off of the position mends it."""
+    """Frequencies without drift count more, where the encoder's noise builds the columns. The bias of inertia and
+    stiffness is taken off as far as it is known; the reason names the noise, and a lower cut-off of the position needs
+    no correction."""
     estimates = drifting()
     assert (estimates.verdicts.verdict == WEAK).all()
     assert all("position noise alone builds" in reason for reason in estimates.verdicts.reason)
@@ -133,7 +135,7 @@ def test_beside_a_slow_drift_noise_of_the_position_is_named_and_the_remedy_helps
         return (value.mean(axis=0) - SLOW_TRUTH) / np.sqrt((stderr**2).sum(axis=0)) * len(value)
 
     mended = drifting(position_cutoff=5.0)
-    assert np.abs(biased(estimates))[[0, 2]].min() > 3
+    assert np.abs(biased(estimates)).max() < 3
     assert np.abs(biased(mended)).max() < 2
     # Few windows can be trusted in the stiffness, those where it comes out large: all of them are asked.
     relative = np.median(mended.stderr, axis=0) / np.abs(mended.value.mean(axis=0))

@@ -13,7 +13,7 @@ from scipy.signal import lfilter, sosfreqz
 
 from jaximp import signals
 from jaximp.identification.filter_settings import FilterSettings
-from jaximp.identification.identify import estimate, in_windows
+from jaximp.identification.identify import estimate, in_windows, solve_windows
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.prepared import prepare
 from jaximp.identification.regression import Rows
@@ -111,7 +111,8 @@ def test_estimates_are_those_of_the_rows_as_they_were_filtered(ankles: ModuleTyp
     prepared = prepare(ankles.pipeline(200.0, estimates="ordinary"), recording)
     found, other = in_windows(prepared)[0], estimate(ankles.pipeline(200.0), recording)[0]
     rows, size = prepared.rows, prepared.pipeline.window_rows
-    for k, theta in enumerate(found.value[1:-1], 1):
+    solved = solve_windows([prepared])[0].solved[0].fit.theta
+    for k, theta in enumerate(np.asarray(solved)[1:-1], 1):
         window = slice(k * size, (k + 1) * size)
         np.testing.assert_allclose(theta, np.linalg.lstsq(rows.W[window], rows.torque[window])[0], rtol=1e-8)
     np.testing.assert_array_equal(found.dof, other.dof)
