@@ -89,7 +89,9 @@ def _say_result(estimates: Estimates) -> None:
     typer.echo("mean and standard deviation over the trusted windows:")
     for name, unit, mean, sd in zip(shown.names, shown.units, means, sds, strict=True):
         said = f"{mean:11.4g} ({sd:.2g}) {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"
-        if name in loose:
+        if name in shown.changed and math.isfinite(mean):
+            said = f"{'not one value':>13}: {shown.changed[name]}"
+        elif name in loose:
             times = f"{loose[name]:.0%} of it" if loose[name] < 1 else f"{loose[name]:.2g} times as large"
             said += f", not determined: its standard error in one window is {times}"
         typer.echo(f"{name:>20} {said}")

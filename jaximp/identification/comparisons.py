@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,10 @@ from jaximp.identification.whitening import White
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
 from jaximp.models.reflex import pathway_of
-from jaximp.trust.changes import find_changes
+from jaximp.trust.changes import Change, find_changes, levels
 from jaximp.trust.frequencies import ByFrequency, estimate_by_frequency
 from jaximp.trust.score_tests import p_in_words
+from jaximp.types import Numbers
 
 
 def compared(model: Model) -> list[int]:
@@ -52,14 +54,30 @@ def by_frequency(pipeline: Pipeline, rows: Rows, several: Sequence[White]) -> tu
     return () if found is None else (found,)
 
 
-def changes(pipeline: Pipeline, fit: SlidingFit, which: NDArray[np.int64]) -> list[str]:
-    """Which parameters are not the same in windows that share no rows, in words; `which` these are."""
+def changes(
+    pipeline: Pipeline, fit: SlidingFit, which: NDArray[np.int64], start: Numbers, end: Numbers
+) -> dict[str, str]:
+    """Parameters that are not the same in windows that share no rows, and what they are when, in words.
+
+    **Arguments:** `which` these windows are; `start` and `end` (M,) of all [s].
+    """
     model, columns = pipeline.model, compared(pipeline.model)
-    doubt = "" if pipeline.whitens else "; or its errors are too small, since the noise was taken as white"
     value, stderr, dof = (np.asarray(x)[which] for x in (fit.theta, fit.stderr, fit.dof))
-    found = find_changes(value[:, columns], stderr[:, columns], dof)
-    return [
-        f"{model.names[columns[k]]} is not the same in all windows: from {one.low:.3g} to {one.high:.3g} "
-        f"{model.units[columns[k]]}, {p_in_words(one.p)}{doubt}"
-        for k, one in found.items()
+    known = np.isfinite(value).all(axis=1) & (stderr > 0).all(axis=1)
+    value, stderr, dof, which = value[known], stderr[known], dof[known], which[known]
+    return {
+        model.names[columns[k]]: _when(one, value[:, columns[k]], stderr[:, columns[k]], start[which], end[which])
+        + f" {model.units[columns[k]]}, {p_in_words(one.p)}"
+        for k, one in find_changes(value[:, columns], stderr[:, columns], dof).items()
+    }
+
+
+def _when(change: Change, value: Numbers, stderr: Numbers, start: Numbers, end: Numbers) -> str:
+    """`40 until 150 s, then 80`; or between which values it changes."""
+    found = levels(value, stderr)
+    if len(found) < 2:
+        return f"between {change.low:.3g} and {change.high:.3g}"
+    until = [
+        f"{one.value:.3g} until {(end[one.last] + start[after.first]) / 2:.4g} s" for one, after in pairwise(found)
     ]
+    return ", then ".join([*until, f"{found[-1].value:.3g}"])

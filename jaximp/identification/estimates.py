@@ -114,6 +114,8 @@ class Estimates(Result):
     """Of each joint the estimates by bands of frequencies, where curves were wanted and there is enough to compare."""
     lacking: Mapping[str, str] = field(default_factory=dict)
     """Parameters that what the model lacks moves beyond error and a share that matters, and why, in words."""
+    changed: Mapping[str, str] = field(default_factory=dict)
+    """Parameters that are not the same in windows that share no rows, and what they are when, in words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -76,6 +76,7 @@ def judge(
         _delay(prepared, rows, misfits),
         *notes,
     )
+    changed = changes(pipeline, fit, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -92,7 +93,8 @@ def judge(
         torque=torque,
         reconstructed=reconstructed,
         predicted=predicted,
-        notes=(*prepared.recording.notes, *filter(None, about), *changes(pipeline, fit, side_by_side)),
+        notes=(*prepared.recording.notes, *filter(None, about), *_changes_in_words(pipeline, changed)),
+        changed=changed,
         reflexes=reflexes,
         misfits=misfits,
         bands=of_model.bands,
@@ -136,10 +138,15 @@ def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limi
     if ranges is None or not isinstance(model, HumanJoint) or model.units[2] != plausibility.UNITS[2]:
         return measured
     which = [model.names.index(name) for name in plausibility.PARAMETERS]
-    factor = np.asarray(model.at_joint(np.ones(len(model.names))))[which]
+    factor = np.ones(3) if model.gear_ratio == 1 else np.asarray(model.at_joint(np.ones(len(model.names))))[which]
     theta, stderr = (np.asarray(x)[:, which] * factor for x in (fit.theta, fit.stderr))
     outside = plausibility.times_outside(theta, stderr, ranges, limits.errors_apart)
     return replace(measured, impedance=theta, outside=outside)
+
+
+def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str]) -> list[str]:
+    doubt = "" if pipeline.whitens else "; or its errors are too small, since the noise was taken as white"
+    return [f"{name} is not the same in all windows: {when}{doubt}" for name, when in changed.items()]
 
 
 def _delay(prepared: Prepared, rows: Rows, misfits: tuple[Misfit, ...]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from jaximp.trust.score_tests import FAMILYWISE, SHARE
 from jaximp.types import Numbers
 
+MOST_LEVELS, MOST_COMPARED = 4, 200
+"""Levels that a summary names, and windows among which they are sought."""
 FEWEST = 3
 """Windows that are compared."""
 
@@ -66,3 +69,44 @@ def find_changes(value: Numbers, stderr: Numbers, dof: Numbers) -> dict[int, Cha
     value, stderr, dof = value[known], stderr[known], dof[known]
     found = {k: same_in_all(value[:, k], stderr[:, k], dof) for k in range(value.shape[1])}
     return {k: one for k, one in found.items() if one.p < FAMILYWISE / len(found) and one.matters}
+
+
+class Level(NamedTuple):
+    """Windows in a row with one value."""
+
+    first: int
+    last: int
+    value: float
+
+
+def levels(value: Numbers, stderr: Numbers) -> list[Level]:
+    """The fewest levels, one after another, that leave no more scatter than the errors of K estimates (K,) explain;
+    none where even `MOST_LEVELS` do not, as of a parameter that changes steadily.
+
+    **Source:** optimal partitions by dynamic programming, Fisher 1958.
+    """
+    from scipy.special import chdtrc
+
+    count, every = len(value), -(-len(value) // MOST_COMPARED)
+    value, stderr = value[::every], stderr[::every]
+    weight = 1 / stderr**2
+    sums = [np.concatenate([np.zeros(1), np.cumsum(x)]) for x in (weight, weight * value, weight * value**2)]
+    w, wv, wvv = (x[None, :] - x[:, None] for x in sums)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cost = np.where(w > 0, wvv - wv**2 / w, np.inf)  # of one level from the first index up to the second
+    best, cuts = cost[0], []
+    for parts in range(1, MOST_LEVELS + 1):
+        if parts > 1:
+            whole = best[:, None] + cost
+            cuts.append(whole.argmin(axis=0))
+            best = whole.min(axis=0)
+        free = len(value) - parts
+        if free > 0 and chdtrc(free, max(float(best[-1]), 0)) > FAMILYWISE:
+            ends = [len(value)]
+            for cut in reversed(cuts):
+                ends.append(int(cut[ends[-1]]))
+            edges = [0, *ends[::-1]]
+            means = [float(wv[a, b] / w[a, b]) for a, b in pairwise(edges)]
+            last = [min(every * b, count) - 1 for b in edges[1:]]
+            return [Level(every * a, b, mean) for a, b, mean in zip(edges, last, means, strict=False)]
+    return []

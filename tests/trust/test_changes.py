@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from statsmodels.stats.oneway import anova_oneway
 
-from jaximp.trust.changes import find_changes, same_in_all
+from jaximp.trust.changes import find_changes, levels, same_in_all
 from jaximp.trust.score_tests import FAMILYWISE
 
 
@@ -61,3 +61,22 @@ def test_a_change_that_is_sure_but_small_is_not_told() -> None:
     assert found.p < 1e-6
     assert not found.matters
     assert find_changes(value, np.full((20, 1), 1e-3), np.full(20, 50.0)) == {}
+
+
+@pytest.mark.parametrize("values", [[40.0, 80.0], [1.0, 2.0, 1.5], [3.0]])
+def test_levels_are_found(values: list[float]) -> None:
+    truth = np.repeat(values, 30)
+    found = levels(truth + 0.05 * np.random.default_rng(len(values)).normal(size=len(truth)), np.full(len(truth), 0.05))
+    np.testing.assert_allclose([one.value for one in found], values, atol=0.05)
+    assert [one.first for one in found] == [30 * k for k in range(len(values))]
+    assert [one.last for one in found] == [30 * k + 29 for k in range(len(values))]
+
+
+def test_a_steady_change_has_no_levels() -> None:
+    assert levels(np.linspace(1, 2, 60), np.full(60, 0.01)) == []
+
+
+def test_of_many_windows_some_are_compared() -> None:
+    truth = np.repeat([1.0, 2.0], 500)
+    found = levels(truth + 0.1 * np.random.default_rng(0).normal(size=1000), np.full(1000, 0.1))
+    assert [one.last for one in found] == [499, 999]
