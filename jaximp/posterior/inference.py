@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.util import find_spec
 from itertools import pairwise
 
 import equinox as eqx
@@ -51,11 +52,13 @@ from jaximp.posterior.draws import (
     credible_interval,
     derive,
     exact_posterior,
+    labels,
     probability_greater,
     stacked,
 )
 from jaximp.posterior.ensemble import sample_posterior
 from jaximp.posterior.hamiltonian import sample_many
+from jaximp.posterior.laplace import normal_many
 from jaximp.posterior.predictive import PriorPredictive, log_scores, mean_score, prior_predictive, torque_bands
 from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior, make_prior
 from jaximp.results import Column, Result
@@ -519,6 +522,9 @@ class _Data:
                 heavy_tails=settings.heavy_tails, column_noise=column_noise,
             )  # fmt: skip
             starts, covariances = (np.asarray(x) for x in _laplace(densities))
+            if find_spec("blackjax") is None:
+                names, units = labels(densities, starts.shape[1], None, None)
+                return normal_many(starts, covariances, key, ess=settings.ess, names=names, units=units), list(reasons)
             return sample_many(densities, starts, covariances, key, ess=settings.ess), list(reasons)
         except ValueError as error:
             return None, [str(error)] * len(parts)

@@ -91,6 +91,19 @@ def test_windows_that_contradict_each_other_are_said() -> None:
 
 
 @pytest.mark.slow
+def test_windows_contradict_each_other_also_where_no_sampler_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaximp.posterior.inference.find_spec", lambda name: None)
+    first, second = joint(seed=1), joint(seed=2, stiffness=40.0)
+    torque = np.where(np.arange(len(first))[:, None] < 4000, first.torque, second.torque)
+    job = parse_job(JOB + "[posterior]\nheavy_tails = true\ness = 400\n")
+    found = infer_recording(job, replace(first, torque=torque))
+    assert "the windows contradict each other in stiffness" in found.why
+    assert found.windows is not None
+    assert found.windows.sampler.startswith("Laplace's normal approximation")
+    np.testing.assert_allclose(found.windows.samples[[0, -1], :, 2].mean(axis=1), [20, 40], rtol=0.05)
+
+
+@pytest.mark.slow
 def test_a_prior_pulls_by_its_weight() -> None:
     job = parse_job(JOB + "[posterior.prior]\nstiffness = { mean = 25, sd = 0.01 }\n")
     pulled = infer_recording(job, joint()).whole
