@@ -6,14 +6,18 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from jaximp import signals
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
 from jaximp.identification.whitening import whiten
 from jaximp.types import AnyArray, Numbers
 
-LONGEST = 0.1
-"""[s]"""
+LONGEST, REST = 0.05, 0.01
+"""Delays that are looked for, and beside one that was found [s]."""
+GUARD = 32
+"""Rows at either end over which the torque fades out."""
 FINER = 8
 """Delays that are looked at between one row and the next, before the best is refined."""
 AGAIN, SMALL = 5, 0.3
@@ -45,7 +49,9 @@ class Delay(NamedTuple):
 UNKNOWN = Delay(np.nan, np.inf)
 
 
-def delay_of(W: AnyArray, torque: AnyArray, valid: AnyArray, row_rate: float, every: int = 1) -> Delay:
+def delay_of(
+    W: AnyArray, torque: AnyArray, valid: AnyArray, row_rate: float, every: int = 1, longest: float = LONGEST
+) -> Delay:
     """The delay with which least squares of the rows of one joint leave least of the torque.
 
     The correlation of every column with the torque at all delays is one inverse FFT; that of the parameters does not
@@ -53,22 +59,24 @@ def delay_of(W: AnyArray, torque: AnyArray, valid: AnyArray, row_rate: float, ev
     (Gauss-Newton), and is right where the noise is white.
 
     **Arguments:** `W` (N, p), `torque` (N,) and `valid` (N,) of rows at `row_rate` [Hz], of which so many (`every`)
-    say as much as one.
+    say as much as one; the `longest` delay that is looked for [s].
     """
-    counts = np.asarray(valid)
-    W, y = np.where(counts[:, None], W, 0), np.where(counts, torque, 0)
-    free, most = counts.sum() / every - W.shape[1] - 1, int(LONGEST * row_rate)
-    if free < W.shape[1] or 4 * most > len(y) or not (W.any(axis=0)).all():
+    most = max(1, int(longest * row_rate))
+    # Rows count whose torque is known however late it is, away from the ends, where shifts of a torque ring.
+    counts = signals.widen_gaps(np.asarray(valid), most + 1)
+    counts[: GUARD + most] = counts[max(0, len(counts) - GUARD - most) :] = False
+    if counts.sum() / every - W.shape[1] - 1 < W.shape[1] or not np.asarray(W)[counts].any(axis=0).all():
         return UNKNOWN
-    search = _Search(W, y, row_rate)
+    rise = np.minimum(np.arange(len(counts)), np.arange(len(counts))[::-1]).clip(max=GUARD) / GUARD
+    search = _Search(np.asarray(W), np.asarray(torque) * np.sin(np.pi / 2 * rise) ** 2, counts, row_rate)
     tried = np.arange(-most * FINER, most * FINER + 1) / (FINER * row_rate)
-    best = int(np.argmax(search.explained(tried)))
+    best = int(np.argmin(search.left(tried)))
     if best in (0, len(tried) - 1):
         return Delay(float(tried[best]), np.inf)
     found, curvature = _refined(search, float(tried[best]), 1 / (FINER * row_rate))
-    left = float(y @ y) - float(search.explained(np.array([found]))[0])
+    left = float(search.left(np.array([found]))[0])
     variance = every * left / counts.sum() * 2 / max(curvature, np.finfo(float).tiny)
-    return Delay(found, float(np.sqrt(variance)))
+    return Delay(found, float(np.sqrt(max(variance, 0))))
 
 
 def find_delay(pipeline: Pipeline, rows: Rows) -> Delay:
@@ -85,7 +93,7 @@ def find_delay(pipeline: Pipeline, rows: Rows) -> Delay:
             return found
         total += found.seconds
         white = whiten(pipeline, replace(rows, torque=moved_forward(torque, total, row_rate)))
-        found = delay_of(white.W, white.torque, rows.valid, row_rate, white.every)
+        found = delay_of(white.W, white.torque, rows.valid, row_rate, white.every, REST)
         if abs(found.seconds) < SMALL * found.stderr:
             break
     return Delay(total + found.seconds, found.stderr)
@@ -100,26 +108,28 @@ def moved_forward(x: Numbers, seconds: float, rate: float) -> Numbers:
 
 
 class _Search:
-    """Of the torque that the model explains, after any shift."""
+    """What the model leaves of the torque, after any shift of the torque."""
 
-    def __init__(self, W: Numbers, y: Numbers, rate: float):
+    def __init__(self, W: Numbers, y: Numbers, counts: NDArray[np.bool_], rate: float):
         n = 1 << (2 * len(y) - 1).bit_length()
+        W = np.where(counts[:, None], W, 0)
+        size = np.sqrt((W**2).sum(axis=0))
+        self.inverse = np.linalg.pinv((W / size).T @ (W / size))
         self.angular = 2 * np.pi * np.fft.rfftfreq(n, 1 / rate)
-        self.cross = np.conj(np.fft.rfft(W, n, axis=0)) * np.fft.rfft(y, n)[:, None]
-        self.cross[1:] *= 2
-        self.cross /= n
-        scale = np.sqrt((W**2).sum(axis=0))
-        self.cross /= scale
-        self.inverse = np.linalg.pinv((W / scale).T @ (W / scale))
+        # The last is the sum of squares of the torque itself over the rows that count.
+        columns, of = np.concatenate([W / size, counts[:, None]], axis=1), np.stack([*[y] * W.shape[1], y**2], axis=1)
+        self.cross = np.conj(np.fft.rfft(columns, n, axis=0)) * np.fft.rfft(of, n, axis=0) / n
+        self.cross[1:-1] *= 2
         self.n, self.rate = n, rate
 
-    def explained(self, delays: Numbers) -> Numbers:
+    def left(self, delays: Numbers) -> Numbers:
         """(K,) sum of squares, with the torque moved forward by each delay [s]."""
-        shared = self.correlations(delays)
-        return np.einsum("ki,ij,kj->k", shared, self.inverse, shared)
+        found = self._correlations(delays)
+        shared = found[:, :-1]
+        return np.asarray(found[:, -1] - np.einsum("ki,ij,kj->k", shared, self.inverse, shared))
 
-    def correlations(self, delays: Numbers) -> Numbers:
-        """(K, p) of every column with the torque."""
+    def _correlations(self, delays: Numbers) -> Numbers:
+        """(K, p + 1) of every column with the torque."""
         if len(delays) < FINER:
             turned = np.exp(1j * self.angular * delays[:, None])
             return np.asarray((turned @ self.cross).real)
@@ -134,11 +144,11 @@ def _refined(search: _Search, delay: float, step: float) -> tuple[float, float]:
     """The best delay near another [s], and the second derivative of what is left there."""
     curvature = 0.0
     for _ in range(STEPS):
-        before, here, after = search.explained(delay + step * np.array([-1.0, 0.0, 1.0]))
-        curvature = (2 * here - before - after) / step**2
+        before, here, after = search.left(delay + step * np.array([-1.0, 0.0, 1.0]))
+        curvature = (before + after - 2 * here) / step**2
         if curvature <= 0:
             return delay, 0.0
-        move = float(np.clip((after - before) / (2 * step * curvature), -step, step))
+        move = float(np.clip((before - after) / (2 * step * curvature), -step, step))
         delay += move
         if abs(move) < 1e-9:
             break

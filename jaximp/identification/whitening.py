@@ -81,7 +81,8 @@ class White:
         count, which has the size of the noise.
         """
         frequency = np.linspace(0, row_rate / self.every / 2, FREQUENCIES)
-        variance = np.nanmean(np.reshape(left, (len(left), -1)) ** 2, axis=0)
+        squares = np.reshape(left, (len(left), -1)) ** 2
+        variance = np.nansum(squares, axis=0) / np.maximum(np.isfinite(squares).sum(axis=0), 1)
         of_filters, found = self.filtered.spectrum(frequency, row_rate), [frequency]
         for noise, size in zip(self.noise, variance, strict=True):
             shape = of_filters * noise.spectrum(frequency, row_rate)
