@@ -39,10 +39,12 @@ SINGULAR = 1e-14
 """What the other columns must leave of a column's square: below, rounding decides."""
 STRETCHES, SHORTEST = 1000, 50
 """A recording is cut into so many stretches, of so many samples at least."""
-LOST, KNOWN = 100.0, 5.0
-"""A parameter is lost where the memory knows it so many times worse than at best, and known again where it does so."""
-FADING = 1e-3
-"""The best of the past is forgotten so much more slowly than samples are: else one glitch would stay the best."""
+LOST, KNOWN, USUAL = 100.0, 10.0, 2.0
+"""A parameter is lost where its column is so many times less excited than at best, and known again where it is so many
+times at most, and at most so many times less than of late."""
+FADING, OF_LATE = 1e-3, 5e-2
+"""The best of the past, and that of late, are forgotten so much more slowly than samples are: no glitch, and no large
+motion of long ago, stays the best."""
 NO_FREEDOM = 1e-9
 """Share of the weights that residuals must keep."""
 
@@ -65,8 +67,8 @@ class RecursiveState(eqx.Module):
     """The estimate."""
     known: RecursiveFit
     """The last estimate that was known well."""
-    best: Float[Array, " p"]
-    """Smallest standard errors so far for noise of one."""
+    best: Float[Array, "2 p"]
+    """Largest excitation of every column so far, and of late."""
     count: Int[Array, ""]
     """Samples so far."""
 
@@ -80,7 +82,7 @@ def init(n_parameters: int) -> RecursiveState:
         theta=several, stderr=several, dof=none, cond=none, sigma_min=none, excitation=several, residual_rms=none,
         vaf=none, samples=jnp.zeros((), int), held=jnp.array(False), renewed=jnp.array(-1),
     )  # fmt: skip
-    return RecursiveState(sums, nothing, nothing, jnp.full(p, jnp.inf), jnp.zeros((), int))
+    return RecursiveState(sums, nothing, nothing, jnp.zeros((2, p)), jnp.zeros((), int))
 
 
 def step(
@@ -103,9 +105,9 @@ def step(
     sums = _absorb(state.sums, row[:, None], kept)
     now = jax.tree.map(lambda x: x[..., 0], _estimate(sums, len(w), noise_variance))
     fit = _as_fit(now, False, jnp.where(valid, state.count, state.fit.renewed))
-    unit = jax.lax.stop_gradient(now.unit)
-    best = jnp.minimum(unit, state.best * jnp.exp(jnp.where(valid, _fading(forgetting), 0)))
-    known, lost = _known_and_lost(unit, best)
+    excitation = _watched_excitation(now)
+    best = jnp.maximum(excitation, state.best * jnp.exp(-jnp.where(valid, _fading(forgetting), 0)))
+    known, lost = _known_and_lost(excitation, *best)
     held = ~known & (lost | state.fit.held)
     last_known = _where(known, fit, state.known)
     fit = _where(held, eqx.tree_at(lambda f: f.held, last_known, jnp.array(True)), fit)
@@ -133,10 +135,10 @@ def recursive_least_squares(
     They hold for white noise and constant parameters. `cond`, `sigma_min` and `excitation` are those of the rows, each
     times the root of its weight, and `samples` is the sum of the weights. NaN until the samples determine everything.
 
-    **Rest:** where motion stops, memory fades and noise takes over. Once it would know a parameter `LOST` times worse
-    than at best, `held` says so, and the estimate with its errors stays that of the last sample where all were known
-    `KNOWN` times worse than at best or better, until they are again. It answers for the time before (`renewed`).
-    `trust.judge_recursive` makes verdicts of it.
+    **Rest:** where motion stops, memory fades and noise takes over. Once a column is `LOST` times less excited than at
+    best, `held` says so, and everything stays as it was when all columns were last excited about as usual (`KNOWN`
+    times less than at best, `USUAL` times less than of late), until they are again. Such an estimate answers for the
+    time before (`renewed`). `trust.judge_recursive` makes verdicts of it.
 
     **Raises:** `ValueError` for shapes that disagree, a forgetting factor outside (0, 1] and a variance below zero.
 
@@ -165,8 +167,6 @@ class _Now(NamedTuple):
     """(p, lanes)"""
     stderr: Array
     """(p, lanes)"""
-    unit: Array
-    """(p, lanes) standard errors for noise of one; infinite where nothing is determined."""
     excitation: Array
     """(p, lanes)"""
     dof: Array
@@ -274,7 +274,6 @@ def _estimate(sums: Rows, p: int, variance: float | Array | None) -> _Now:
     return _Now(
         theta=or_nan(jnp.stack(theta)),
         stderr=or_nan(stderr),
-        unit=jnp.where(solvable, unit, jnp.inf),
         excitation=or_nan(1 / jnp.sqrt((inverse**2).sum(axis=1))),
         dof=or_nan(dof, free),
         cond=or_nan(divided(sigma_max, sigma_min)),
@@ -292,10 +291,9 @@ def _of_unit(row: Array) -> Array:
 
 def _watched(found: _Now, forgetting: float | Array, valid: Array) -> RecursiveFit:
     """The estimates of all samples (N, ...), those held where the memory has lost a parameter."""
-    fading = _fading(forgetting) * jnp.cumsum(valid)[:, None]
-    unit = jax.lax.stop_gradient(found.unit)
-    best = jnp.exp(jax.lax.cummin(jnp.log(unit) - fading) + fading)
-    known, lost = _known_and_lost(unit, best)
+    excitation, faded = _watched_excitation(found), _fading(forgetting)[:, None] * jnp.cumsum(valid)[:, None]
+    best = jnp.exp(jax.lax.cummax(jnp.log(excitation) + faded, axis=1) - faded)
+    known, lost = _known_and_lost(excitation, *best)
     index = jnp.arange(len(valid))
 
     def last(which: Array) -> Array:
@@ -308,23 +306,27 @@ def _watched(found: _Now, forgetting: float | Array, valid: Array) -> RecursiveF
     return eqx.tree_at(lambda f: f.held, jax.tree.map(lambda x: x[source], fit), held)
 
 
+def _watched_excitation(found: _Now) -> Array:
+    """(..., p); zero where nothing is determined."""
+    excitation = jax.lax.stop_gradient(found.excitation)
+    return jnp.where(jnp.isnan(excitation), 0, excitation)
+
+
 def _fading(forgetting: float | Array) -> Array:
-    """Logarithm of the factor by which the best standard error grows with every sample."""
-    return FADING * (1 - jax.lax.stop_gradient(jnp.asarray(forgetting)))
+    """(2, 1) logarithms of the factors by which the best excitations fall with every sample."""
+    return jnp.array([[FADING], [OF_LATE]]) * (1 - jax.lax.stop_gradient(jnp.asarray(forgetting)))
 
 
-def _known_and_lost(unit: Array, best: Array) -> tuple[Array, Array]:
+def _known_and_lost(excitation: Array, best: Array, of_late: Array) -> tuple[Array, Array]:
     """Whether all parameters (..., p) are known well, and whether one of them is lost."""
-    known = (unit <= KNOWN * best).all(axis=-1) & jnp.isfinite(unit).all(axis=-1)
-    return known, (unit > LOST * best).any(axis=-1)
+    known = (excitation > 0) & (KNOWN * excitation >= best) & (USUAL * excitation >= of_late)
+    return known.all(axis=-1), (LOST * excitation < best).any(axis=-1)
 
 
 def _as_fit(found: _Now, held: Array | bool, renewed: Array) -> RecursiveFit:
     """Found after one sample, or after all of them."""
     samples = jnp.round(jax.lax.stop_gradient(found.samples)).astype(int)
-    values = found._replace(samples=samples)._asdict()
-    del values["unit"]
-    return RecursiveFit(**values, held=jnp.asarray(held), renewed=renewed)
+    return RecursiveFit(**found._replace(samples=samples)._asdict(), held=jnp.asarray(held), renewed=renewed)
 
 
 def _where(chosen: Array, yes: RecursiveFit, no: RecursiveFit) -> RecursiveFit:
