@@ -62,7 +62,7 @@ class RecursiveState(eqx.Module):
     """All that is remembered of the samples seen so far."""
 
     sums: Rows
-    """Weighted sums of products of w, y and 1, and of w with the squares of the weights."""
+    """Weighted sums of products of w, y and 1, and of w with the squares and the cubes of the weights."""
     fit: RecursiveFit
     """The estimate."""
     known: RecursiveFit
@@ -208,28 +208,35 @@ def _run(W: Array, y: Array, forgetting: float | Array, valid: Array, variance: 
 
 
 def _no_sums(p: int, lanes: int, dtype: np.dtype) -> Rows:
-    sizes = [*range(p + 2, 0, -1), *range(p, 0, -1), 1]
+    sizes = [*range(p + 2, 0, -1), *range(p, 0, -1), *range(p, 0, -1), 1]
     return tuple(jnp.zeros((size, lanes), dtype) for size in sizes)
 
 
 def _absorb(sums: Rows, row: Array, forgetting: Array) -> Rows:
-    """Take in one row of w, y and 1 per lane: p + 2 rows of their products, p of those of w for squared weights, and
-    the sum of these."""
-    p, square = len(row) - 2, forgetting**2
-    first = [forgetting * s + row[i] * row[i:] for i, s in enumerate(sums[: p + 2])]
-    second = [square * s + row[i] * row[i:p] for i, s in enumerate(sums[p + 2 : -1])]
-    return keep((*first, *second, square * sums[-1] + row[-1:]))
+    """Take in one row of w, y and 1 per lane: p + 2 rows of their products, p of those of w for squared weights and p
+    for cubed ones, and the sum of the squared weights."""
+    p = len(row) - 2
+    products = [row[i] * row[i:] for i in range(p + 2)]
+    first, second, third = sums[: p + 2], sums[p + 2 : 2 * p + 2], sums[2 * p + 2 : -1]
+    return keep(
+        (
+            *(forgetting * s + new for s, new in zip(first, products, strict=True)),
+            *(forgetting**2 * s + new[:-2] for s, new in zip(second, products[:p], strict=True)),
+            *(forgetting**3 * s + new[:-2] for s, new in zip(third, products[:p], strict=True)),
+            forgetting**2 * sums[-1] + row[-1:],
+        )
+    )
 
 
 def _sums_before(sums: Rows, decay: Array, p: int) -> Rows:
     """What all stretches before each one leave of their sums."""
     flat = jnp.concatenate(sums)
     ends = np.cumsum([len(row) for row in sums])
-    squared = jnp.asarray(np.arange(len(flat)) >= ends[p + 1])
+    power = np.repeat([1, 2, 3, 2], [ends[p + 1], p * (p + 1) // 2, p * (p + 1) // 2, 1])
 
     def follow(before: Array, stretch: tuple[Array, Array]) -> tuple[Array, Array]:
         own, kept = stretch
-        return jnp.where(squared, kept**2, kept) * before + own, before
+        return jnp.stack([jnp.ones_like(kept), kept, kept**2, kept**3])[power] * before + own, before
 
     before = jax.lax.scan(follow, jnp.zeros_like(flat[:, 0]), (flat.T, decay))[1].T
     return keep(tuple(before[end - len(row) : end] for end, row in zip(ends, sums, strict=True)))
@@ -249,13 +256,13 @@ def _estimate(sums: Rows, p: int, variance: float | Array | None) -> _Now:
     given = jnp.stack([jnp.concatenate([jnp.zeros_like(row[:1])] * i + [row]) for i, row in enumerate(alone)])
     sigma_max, sigma_min = extreme_singular_values(given, inverse)
 
-    twice = symmetric(sums[p + 2 : -1])
+    twice, thrice = symmetric(sums[p + 2 : 2 * p + 2]), symmetric(sums[2 * p + 2 : -1])
     half = keep(jnp.stack([sum_of(twice[i, k] * inverse[k] for k in range(p)) for i in range(p)]))
     shape = keep(jnp.stack([sum_of(inverse[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
     spread = keep(jnp.stack([sum_of(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     lost = sum_of(shape[i, i] for i in range(p))
-    # tr(A^-1 W' D^3 W) is no less than lost^2 / p, and hardly more: the weights of all columns fall alike.
-    freedom, freedom_squared = weight - lost, weight_squared - 2 * lost**2 / p + (shape**2).sum(axis=(0, 1))
+    cubes = sum_of((thrice[i] * sum_of(inverse[i, k] * inverse[:, k] for k in range(p))).sum(axis=0) for i in range(p))
+    freedom, freedom_squared = weight - lost, weight_squared - 2 * cubes + (shape**2).sum(axis=(0, 1))
     unit, free = root((spread * inverse).sum(axis=1)), solvable & (freedom > NO_FREEDOM * weight)
     freedom, freedom_squared = jnp.where(free, freedom, 1), jnp.where(free, freedom_squared, 1)
     if variance is None:

@@ -152,8 +152,7 @@ def test_errors_are_those_of_the_weighted_sums(forgetting: float) -> None:
         unit = np.sqrt(np.diagonal(gain @ gain.T))
         np.testing.assert_allclose(fit.stderr[k], np.sqrt(variance) * unit, rtol=1e-7)
         np.testing.assert_allclose(known.stderr[k], 0.2 * unit, rtol=1e-7)
-        # The third powers of the weights are bounded by their squares: never too many, and hardly too few.
-        assert 0.93 < float(fit.dof[k]) / (np.trace(kernel) ** 2 / np.trace(kernel @ kernel)) < 1 + 1e-9
+        assert fit.dof[k] == pytest.approx(np.trace(kernel) ** 2 / np.trace(kernel @ kernel), rel=1e-7)
         singular = np.linalg.svd(np.sqrt(d)[:, None] * rows, compute_uv=False)
         assert fit.cond[k] == pytest.approx(singular[0] / singular[-1], rel=1e-7)
         assert fit.sigma_min[k] == pytest.approx(singular[-1], rel=1e-7)
