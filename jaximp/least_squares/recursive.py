@@ -142,9 +142,9 @@ def recursive_least_squares(
 
     **Raises:** `ValueError` for shapes that disagree, a forgetting factor outside (0, 1] and a variance below zero.
 
-    **Source:** Tout et al. 2023, section IV-B. Holding the estimate while there is no excitation is the conditional
-    updating of Åström and Wittenmark 1995, section 11.5; Goel, Bruce and Bernstein 2020 compare what else there is
-    against wind-up. It leaves all other estimates those of exponential forgetting, as directional forgetting does not.
+    **Source:** Tout et al. 2023, section IV-B. What becomes of the covariance without excitation, and what else there
+    is against it: Lai and Bernstein 2024 (arXiv 2404.10844). Holding the estimate is the conditional updating of Åström
+    and Wittenmark 1995. It leaves all other estimates those of exponential forgetting; directional forgetting does not.
     """
     require_float64(W, y)
     W, y = jnp.asarray(W, float), jnp.asarray(y, float)
