@@ -12,7 +12,16 @@ from jaxtyping import Array
 
 from jaximp.least_squares.sums import Plan, squared_norms
 from jaximp.numerics.compilation import keep
-from jaximp.numerics.lanes import Rows, cholesky, divided, extreme_singular_values, substitute, sum_of
+from jaximp.numerics.lanes import (
+    Rows,
+    cholesky,
+    divided,
+    extreme_singular_values,
+    inverse_of_rows,
+    substitute,
+    sum_of,
+    symmetric,
+)
 from jaximp.numerics.linear_algebra import root
 
 DOUBT = 1e-2
@@ -196,19 +205,14 @@ def _triangle_and_inverses(triangle: Rows, R: Array) -> tuple[Array, Array, Arra
     """Inverse of the window's triangle, the triangle in the given units, and the inverse of that; (p, p, lanes)."""
     p, scale = len(R), R[:, :, None]
     given = keep(jnp.stack([sum_of(row[k - i] * scale[k] for k in range(i, p)) for i, row in enumerate(triangle)]))
-    own = list(jnp.eye(p, dtype=R.dtype)[:, :, None] * jnp.ones_like(given[0, 0]))
-    for i in reversed(range(p)):
-        rest = own[i]
-        for k in range(i + 1, p):
-            rest = rest - triangle[i][k - i] * own[k]
-        own[i] = keep(divided(rest, triangle[i][0]))
+    own = inverse_of_rows(triangle)
     inverse = list(own)
     for i in reversed(range(p)):
         rest = own[i]
         for k in range(i + 1, p):
             rest = rest - R[i, k] * inverse[k]
         inverse[i] = keep(rest / R[i, i])
-    own_inverse, given_inverse = keep((jnp.stack(own), jnp.stack(inverse)))
+    own_inverse, given_inverse = keep((own, jnp.stack(inverse)))
     return own_inverse, given, given_inverse
 
 
@@ -219,7 +223,7 @@ def _coloured(
     the residuals' sum of squares would be for noise of just this autocovariance."""
     p = len(own)
     within = keep(tuple(all_ - lost for all_, lost in zip(sums[-len(across) :], across, strict=True)))
-    once, twice, (squares,) = _full(within[:p]), _full(within[p : 2 * p]), within[2 * p]
+    once, twice, (squares,) = symmetric(within[:p]), symmetric(within[p : 2 * p]), within[2 * p]
     half = keep(jnp.stack([sum_of(once[i, k] * own[k] for k in range(p)) for i in range(p)]))
     shape = keep(jnp.stack([sum_of(own[k, i] * half[k] for k in range(i + 1)) for i in range(p)]))
     gram = jnp.stack([sum_of(own[i, k] * own[:, k] for k in range(i, p)) for i in range(p)])
@@ -228,9 +232,3 @@ def _coloured(
     spread = keep(jnp.stack([sum_of(inverse[i, k] * shape[k] for k in range(i, p)) for i in range(p)]))
     variance = (spread * inverse).sum(axis=1) * (rss / jnp.where(trace > 0, trace, 1))
     return jnp.where(trace > 0, root(variance), jnp.nan), divided(trace**2, square), trace
-
-
-def _full(triangle: Rows) -> Array:
-    """Symmetric (p, p, lanes) from the rows of its upper triangle."""
-    above = [[triangle[k][i - k][None] for k in range(i)] for i in range(len(triangle))]
-    return keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))

@@ -78,6 +78,24 @@ def substitute(triangle: Rows, p: int) -> list[Array]:
     return inner
 
 
+def inverse_of_rows(triangle: Rows) -> Float[Array, "p p lanes"]:
+    """Inverse of a square triangle."""
+    p = len(triangle)
+    inverse = list(jnp.eye(p, dtype=triangle[0].dtype)[:, :, None] * jnp.ones_like(triangle[0][0]))
+    for i in reversed(range(p)):
+        rest = inverse[i]
+        for k in range(i + 1, p):
+            rest = rest - triangle[i][k - i] * inverse[k]
+        inverse[i] = keep(divided(rest, triangle[i][0]))
+    return jnp.stack(inverse)
+
+
+def symmetric(triangle: Rows) -> Float[Array, "p p lanes"]:
+    """The whole matrix from the rows of its upper triangle."""
+    above = [[triangle[k][i - k][None] for k in range(i)] for i in range(len(triangle))]
+    return keep(jnp.stack([jnp.concatenate([*left, row]) for left, row in zip(above, triangle, strict=True)]))
+
+
 def solve_definite(matrix: Float[Array, "p p"], right: Float[Array, "p k"]) -> Float[Array, "p k"]:
     """`matrix^-1 @ right` of one positive definite matrix."""
     p, k = right.shape

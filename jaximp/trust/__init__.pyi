@@ -4,6 +4,7 @@ from .criteria import confidence as confidence
 from .criteria import fake_change_threshold as fake_change_threshold
 from .criteria import matrix_criteria as matrix_criteria
 from .limits import TrustLimits as TrustLimits
+from .streams import judge_recursive as judge_recursive
 from .verdicts import Rule as Rule
 from .verdicts import Verdict as Verdict
 from .verdicts import Verdicts as Verdicts

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.least_squares.window import SlidingFit
+from jaximp.least_squares.window import Fit, SlidingFit
 from jaximp.models.base import Model, Role
 from jaximp.trust import plausibility
 from jaximp.trust.criteria import USUAL, MatrixCriteria, body_margin, matrix_criteria
@@ -108,11 +108,14 @@ class Windows:
                 return MatrixCriteria(*(np.atleast_1d(pick(getattr(value, field.name))) for field in fields(value)))
             return pick(value) if isinstance(value, np.ndarray) else value
 
-        return Windows(**{field.name: picked(getattr(self, field.name)) for field in fields(self)})
+        return type(self)(**{field.name: picked(getattr(self, field.name)) for field in fields(self)})
+
+
+Measured = TypeVar("Measured", bound=Windows)
 
 
 def measure_windows(
-    fit: SlidingFit,
+    fit: Fit,
     names: Sequence[str],
     roles: Sequence[Role],
     window_samples: int,
@@ -173,13 +176,17 @@ def measure_windows(
 
 def judge_windows(windows: Windows, limits: TrustLimits = USUAL) -> Verdicts:
     """The verdict on every window: that of the first of `RULES` that it breaks."""
+    return judge_all(RULES, with_usual(windows, limits), limits)
+
+
+def with_usual(windows: Measured, limits: TrustLimits) -> Measured:
+    """With the residuals that are usual where the motion determines the parameters."""
     excited = ~np.any([rule.broken(windows, limits) for rule in EXCITATION], axis=0)
-    usual = replace(
+    return replace(
         windows,
         usual_residual=_lower_quartile(windows.residual[excited]),
         usual_unexplained=_lower_quartile(1 - windows.vaf[excited]),
     )
-    return judge_all(RULES, usual, limits)
 
 
 def judge_together(

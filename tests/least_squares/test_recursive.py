@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factories.regressions import THETA, regression
 from jaximp.least_squares.recursive import init, recursive_least_squares, step
+from jaximp.least_squares.window import confidence_interval, least_squares
 
 Numbers = NDArray[np.float64]
 
@@ -132,3 +133,114 @@ def test_whole_numbers_are_taken() -> None:
 def test_float64_off_is_an_error() -> None:
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
         recursive_least_squares(*regression(120))
+
+
+@pytest.mark.parametrize("forgetting", [1.0, 0.9])
+def test_errors_are_those_of_the_weighted_sums(forgetting: float) -> None:
+    """Against dense matrices: covariance, noise, degrees of freedom, condition number and the rest."""
+    W, y = regression(120)
+    y += 5
+    fit = recursive_least_squares(W, y, forgetting)
+    known = recursive_least_squares(W, y, forgetting, noise_variance=0.04)
+    for k in (3, 10, 119):
+        rows, torque, d = W[: k + 1], y[: k + 1], forgetting ** np.arange(k, -1, -1.0)
+        A = np.linalg.inv(rows.T * d @ rows)
+        gain = A @ rows.T * d
+        residual = torque - rows @ (gain @ torque)
+        kernel = np.diag(d) - (d[:, None] * rows) @ gain
+        variance = residual**2 @ d / np.trace(kernel)
+        unit = np.sqrt(np.diagonal(gain @ gain.T))
+        np.testing.assert_allclose(fit.stderr[k], np.sqrt(variance) * unit, rtol=1e-7)
+        np.testing.assert_allclose(known.stderr[k], 0.2 * unit, rtol=1e-7)
+        assert fit.dof[k] == pytest.approx(np.trace(kernel) ** 2 / np.trace(kernel @ kernel), rel=1e-7)
+        singular = np.linalg.svd(np.sqrt(d)[:, None] * rows, compute_uv=False)
+        assert fit.cond[k] == pytest.approx(singular[0] / singular[-1], rel=1e-7)
+        assert fit.sigma_min[k] == pytest.approx(singular[-1], rel=1e-7)
+        np.testing.assert_allclose(fit.excitation[k], 1 / np.sqrt(np.diagonal(A)), rtol=1e-7)
+        mean = (d @ residual) / d.sum(), (d @ torque) / d.sum()
+        vaf = 1 - d @ (residual - mean[0]) ** 2 / (d @ (torque - mean[1]) ** 2)
+        assert fit.vaf[k] == pytest.approx(vaf, rel=1e-7)
+        assert fit.residual_rms[k] == pytest.approx(np.sqrt(d @ residual**2 / d.sum()), rel=1e-7)
+        assert fit.samples[k] == round(d.sum())
+    assert np.isnan(fit.stderr[:3]).all()
+    assert np.isposinf(known.dof[3:]).all()
+
+
+def test_without_forgetting_errors_are_the_textbook_s() -> None:
+    W, y = regression(120)
+    fit, whole = recursive_least_squares(W, y), least_squares(W, y)
+    for name in ("theta", "stderr", "dof", "cond", "sigma_min", "excitation", "residual_rms", "vaf", "samples"):
+        np.testing.assert_allclose(getattr(fit, name)[-1], getattr(whole, name), rtol=1e-7, err_msg=name)
+
+
+SIZES = np.array([30.0, 3.0, 0.3])
+
+
+def rest(seed: int, position_noise: float = 1e-4, n: int = 3000) -> tuple[Numbers, Numbers]:
+    """Motion in the first and the last fifth; between, noise in the rows and an unknown torque."""
+    random = np.random.default_rng(seed)
+    moving = (np.arange(n) < n // 5) | (np.arange(n) >= n - n // 5)
+    W = np.where(moving[:, None], 1, position_noise) * random.normal(size=(n, 3)) * SIZES
+    return W, W @ THETA[:3] + 0.1 * random.normal(size=n) + np.where(moving, 0, 0.5)
+
+
+@pytest.mark.parametrize("position_noise", [0.0, 1e-9, 1e-4])
+def test_rest_holds_what_was_known(position_noise: float) -> None:
+    W, y = rest(0, position_noise)
+    fit = recursive_least_squares(W, y, 0.98)
+    theta, held, renewed = (np.asarray(x) for x in (fit.theta, fit.held, fit.renewed))
+    assert np.isfinite(theta[3:]).all()
+    assert np.abs(theta[200:] / THETA[:3] - 1).max() < 1.5
+    assert held[1100:2400].all()
+    assert not held[3:600].any()
+    assert not held[2500:].any()
+    np.testing.assert_array_equal(theta[1100:2400], np.broadcast_to(theta[1100], (1300, 3)))
+    # Until columns are half as much excited, and what is remembered of them a quarter.
+    assert 600 < renewed[2399] <= 600 + 50 * np.log(4)
+    np.testing.assert_array_equal(theta[2399], theta[renewed[2399]])
+    np.testing.assert_array_equal(renewed[3:600], np.arange(3, 600))
+
+
+def test_streamed_steps_are_the_scan_also_at_rest_and_over_gaps() -> None:
+    W, y = rest(0, n=600)
+    W[[20, 130], 1] = np.nan
+    y[40:50] = np.nan
+    whole = recursive_least_squares(W, y, 0.9, noise_variance=0.01)
+    state, streamed, take = init(3), [], jax.jit(step)
+    for w, torque in zip(W, y, strict=True):
+        state, _ = take(state, w, torque, 0.9, 0.01)
+        streamed.append(state.fit)
+    for name, value in vars(whole).items():
+        found = np.stack([getattr(fit, name) for fit in streamed])
+        np.testing.assert_allclose(found, value, rtol=1e-9, err_msg=name)
+    assert np.asarray(whole.held).any()
+
+
+def test_what_is_not_finite_is_skipped() -> None:
+    W, y = regression(120)
+    broken = y.copy()
+    broken[30:60] = np.nan
+    fit = recursive_least_squares(W, broken, 0.95)
+    kept = np.isfinite(broken)
+    np.testing.assert_allclose(fit.theta[kept], recursive_least_squares(W[kept], y[kept], 0.95).theta, rtol=1e-9)
+    assert (np.asarray(fit.renewed)[30:60] == 29).all()
+
+
+@pytest.mark.optimised
+def test_intervals_hold_the_truth_in_95_percent() -> None:
+    """In motion, as the memory fills, and held through rests: 800 times ten memories of motion and fifteen of rest."""
+    random = np.random.default_rng(1)
+    moving = np.tile(np.arange(250) < 100, 800)[:, None]
+    W = np.where(moving, 1, 1e-6) * random.normal(size=(len(moving), 3)) * SIZES
+    y = W @ THETA[:3] + 0.1 * random.normal(size=len(W))
+    fit = recursive_least_squares(W, y, 0.9)
+    low, high = confidence_interval(fit)
+    inside = ((low <= THETA[:3]) & (THETA[:3] <= high)).reshape(800, 250, 3)
+    assert np.asarray(fit.held)[249::250].all()
+    for k in (20, 99, 249):
+        assert 0.93 < inside[1:, k].mean() < 0.97
+
+
+def test_a_negative_noise_is_refused() -> None:
+    with pytest.raises(ValueError, match="noise_variance is -1"):
+        recursive_least_squares(*regression(120), noise_variance=-1.0)
