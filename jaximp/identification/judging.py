@@ -14,7 +14,17 @@ from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
-from jaximp.identification.misfit import by_bands, harmless, in_words, is_delay, missing, off_by, sizes, unnoticed
+from jaximp.identification.misfit import (
+    by_bands,
+    harmless,
+    in_words,
+    is_delay,
+    missing,
+    off_by,
+    open_moves,
+    sizes,
+    unnoticed,
+)
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.regression import Rows
@@ -58,6 +68,7 @@ def judge(
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
     of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary, weights)
+    sure, fit = fit, _with_open_moves(fit, of_model.moves)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
@@ -76,7 +87,7 @@ def judge(
         _delay(prepared, rows, misfits),
         *notes,
     )
-    changed = changes(pipeline, fit, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
+    changed = changes(pipeline, sure, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -124,6 +135,13 @@ def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement
         return fit
     solved = rows if prepared.pipeline.ordinary else prepared.white[0]
     return corrected(fit, solved.W, solved.noisy, rows.valid, _apart(place))
+
+
+def _with_open_moves(fit: SlidingFit, moves: Numbers) -> SlidingFit:
+    """With standard errors that hold what cannot be excluded; it is the same in all windows, and no sign of change."""
+    if not moves.any():
+        return fit
+    return eqx.tree_at(lambda f: f.stderr, fit, jnp.sqrt(jnp.asarray(fit.stderr) ** 2 + moves**2))
 
 
 def _held_out(solved: Solved) -> NDArray[np.float64]:
@@ -212,7 +230,9 @@ class _OfModel:
     lacking: dict[str, str]
     """Why each parameter cannot be trusted."""
     bands: Bands | None
-    notes: tuple[str, str]
+    moves: Numbers
+    """(p,) by how much parameters that stay trusted may be off, in every window alike."""
+    notes: tuple[str, ...]
 
     @classmethod
     def of(
@@ -239,7 +259,9 @@ class _OfModel:
         others = [text for name, text in lacking.items() if name in judged and name not in off]
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
-        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests, spared=weights)))
+        moves, grown = open_moves(*tests) if misfits else (np.zeros(len(model.names)), "")
+        notes = (harmless(*tests), grown, unnoticed(*tests, spared=weights))
+        return cls(why, remedy, lacking, bands, moves, notes)
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

@@ -305,10 +305,28 @@ def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, s
 
 
 def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
-    """What is missing, but moves no parameter beyond error and `SHARE`: a note."""
+    """What is missing, but moves no parameter beyond error and `SHARE` if it is that: a note."""
     if not _suspected(misfits) or off_by(misfits, names, size, kinds):
         return ""
-    return f"the model lacks {culprits(misfits)}, which moves no parameter by more than {SHARE:.0%} or beyond error"
+    return (
+        f"the model lacks something, which looks like {culprits(misfits)}; if it is that, no parameter is off by more "
+        f"than {SHARE:.0%} or beyond error; if it is something else, how far they are off cannot be told"
+    )
+
+
+def open_moves(
+    misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()
+) -> tuple[Numbers, str]:
+    """(p,) by how much parameters that stay trusted are off if it is one of the suspects, which is not certain: the
+    largest move beyond its error; and a note on that."""
+    off, moves = off_by(misfits, names, size, kinds), np.zeros(len(names))
+    for one in _suspected(misfits):
+        moves = np.maximum(moves, np.where(np.abs(one.move) > ERRORS * one.stderr, np.abs(one.move), 0))
+    moves = np.where([name in off for name in names], 0, moves)
+    shares = [f"{name} by {x / s:.1%}" for name, x, s in zip(names, moves, size, strict=True) if x > 0 and s > 0]
+    if not shares:
+        return moves, ""
+    return moves, f"standard errors have grown by what the model may lack, which would move {', '.join(shares)}"
 
 
 def unnoticed(
