@@ -246,6 +246,18 @@ def backlash(play: float) -> Wrong:
     return Wrong(torque, ("play",))
 
 
+def slipping(share: float, frequency: float) -> Wrong:
+    """A marker on the skin, which follows slow motion less by a share, below some frequency [Hz]."""
+    response = lambda s: impedance(s) / (1 - share / (1 + s / (2 * np.pi * frequency)))  # noqa: E731
+    return Wrong(lambda motion: motion.through(response), ("lag",))
+
+
+def relaxing(share: float, seconds: float) -> Wrong:
+    """Fast motion meets a further share of the stiffness, which relaxes (Maxwell)."""
+    response = lambda s: impedance(s) + share * STIFFNESS * s * seconds / (1 + s * seconds)  # noqa: E731
+    return Wrong(lambda motion: motion.through(response), ("lag",))
+
+
 WRONG: Mapping[str, Wrong] = {
     "weak reflex, 1 N m s/rad": reflex(1.0),
     "strong reflex, 4 N m s/rad": reflex(4.0),
@@ -263,6 +275,9 @@ WRONG: Mapping[str, Wrong] = {
     "cuff of 1250 N m/rad": cuff(1250.0),
     "second mode at 12 Hz": second_mode(),
     "backlash of 0.02 rad": backlash(0.02),
+    "skin slips 15 % below 3 Hz": slipping(0.15, 3.0),
+    "30 % relaxes in 100 ms": relaxing(0.3, 0.1),
+    "30 % relaxes in 500 ms": relaxing(0.3, 0.5),
 }
 
 

@@ -15,6 +15,7 @@ from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.misfit import (
+    Known,
     by_bands,
     harmless,
     in_words,
@@ -247,21 +248,29 @@ class _OfModel:
     ) -> _OfModel:
         """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not; `weights` of a
         reflex, of which nothing is said one by one."""
-        theta = np.asarray(solved.fit.theta)
+        apart, bands = _apart(place), None
+        theta, stderr = (np.asarray(x) for x in (solved.fit.theta, solved.fit.stderr))
         size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
-        tests = (misfits, model.names, size, [role.kind for role in model.roles])
-        off, bands = off_by(*tests), None
-        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
         if solved.beside is not None and misfits:
-            both = np.asarray(solved.beside.theta)[:: _apart(place)], theta[:: _apart(place)]
+            both = np.asarray(solved.beside.theta)[::apart], theta[::apart]
             bands = compare_bands(*(both[::-1] if ordinary else both))
+        tests = (misfits, model.names, size, [role.kind for role in model.roles])
+        known = Known(_error_of_mean(stderr[::apart]), bands)
+        off = off_by(*tests, known)
+        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
         lacking = by_bands(bands, model.names, model.units, ordinary)
         others = [text for name, text in lacking.items() if name in judged and name not in off]
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
-        moves, grown = open_moves(*tests) if misfits else (np.zeros(len(model.names)), "")
-        notes = (harmless(*tests), grown, unnoticed(*tests, spared=weights))
+        moves, grown = open_moves(*tests, known) if misfits else (np.zeros(len(model.names)), "")
+        notes = (harmless(*tests, known), grown, unnoticed(*tests, spared=weights))
         return cls(why, remedy, lacking, bands, moves, notes)
+
+
+def _error_of_mean(stderr: Numbers) -> Numbers:
+    """(p,) of the parameters' mean over windows that share no rows, by their standard errors (K, p)."""
+    known = stderr[np.isfinite(stderr).all(axis=1)]
+    return np.sqrt((known**2).sum(axis=0)) / max(len(known), 1)
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

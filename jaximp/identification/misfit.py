@@ -52,7 +52,8 @@ def find_misfits(
             tests = tests.with_other(window=len(tests.torque))
         return tuple(_as_delayed(_one_after_another(tests)))
     groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
-    return _of_joint(pipeline, Tests.of(pipeline, white, rows.valid, groups)(), theta)
+    tests = Tests.of(pipeline, white, rows.valid, groups)
+    return _of_joint(pipeline, tests(), theta)
 
 
 def _of_joint(pipeline: Pipeline, found: Iterable[Misfit], theta: Numbers) -> tuple[Misfit, ...]:
@@ -82,7 +83,7 @@ class RobotTests:
         white = whiten(np.concatenate([np.asarray(alone.robot), *columns.values()], axis=1), alone.torque, alone.valid)
         tests = Tests.of(pipeline, white, alone.valid, ((name, {0: one}) for name, one in columns.items()))
         tests = tests.with_other(W=tests.W[:, : alone.robot.shape[1]], window=len(tests.torque), moved_in=None)
-        lacking, W = _suspected(tests()), tests.W[tests.valid]
+        lacking, W = _clear(tests()), tests.W[tests.valid]
         weights = {one.group: np.linalg.lstsq(W, tests.groups[one.group][tests.valid])[0] for one in lacking}
         names = " or ".join(what(one.group) for one in lacking)
         return cls(columns, weights, f"the model of the robot lacks {names}" if lacking else "")
@@ -112,7 +113,8 @@ def find_human_misfits(
             else:
                 yield name, {-1: columns[:n]}
 
-    tested = Tests.of(pipeline, found.white, found.valid, groups())()
+    tests = Tests.of(pipeline, found.white, found.valid, groups())
+    tested = tests()
     own = (replace(one, move=one.move[human], stderr=one.stderr[human]) for one in tested)
     return _of_joint(pipeline, own, theta)
 
@@ -182,7 +184,7 @@ def _one_after_another(tests: Tests) -> list[Misfit]:
     while tests.groups:
         these = tests()
         found |= {one.group: one for one in these}
-        best = _suspected(these)
+        best = _clear(these)
         if not best:
             break
         joint = untagged(best[0].group)[1]
@@ -235,35 +237,72 @@ def sizes(usual: Numbers, roles: Sequence[Role]) -> Numbers:
     return found
 
 
+@dataclass(frozen=True)
+class Known:
+    """What bounds moves that no added column shows."""
+
+    errors: Numbers | float = 0.0
+    """(p,) of each parameter's mean over the record."""
+    bands: Bands | None = None
+
+    def within_reach(self, misfit: Misfit, size: Numbers) -> NDArray[np.bool_]:
+        """(p,) parameters that as much torque as this misfit's would move by more than `SHARE` of their size if it
+        looked like them."""
+        return np.sqrt(misfit.statistic) * self.errors > SHARE * size
+
+    def depend(self, count: int) -> NDArray[np.bool_]:
+        """(p,) of so many parameters those that differ, beyond error, with the frequencies that count."""
+        if self.bands is None:
+            return np.zeros(count, bool)
+        return np.abs(self.bands.ordinary - self.bands.generalised) > ERRORS * self.bands.stderr
+
+
+NOTHING_KNOWN = Known()
+
+
 def off_by(
-    misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()
+    misfits: Sequence[Misfit],
+    names: Sequence[str],
+    size: Numbers,
+    kinds: Sequence[str] = (),
+    known: Known = NOTHING_KNOWN,
 ) -> dict[str, float]:
     """Parameters that what is missing moves beyond error and `SHARE` of their `size` (p,), by what share; NaN where it
     may move them so far, but how far cannot be told.
 
-    **Arguments:** `kinds` (p,) of the parameters' roles.
+    What hides a parameter leaves it only where it is small, and the parameter does not depend on the frequency.
+
+    **Arguments:** `kinds` (p,) of the parameters' roles; what is `known` of moves that no column shows.
     """
     found: dict[str, float] = {}
-    for one in _suspected(misfits):
+    suspected = _suspected(misfits)
+    for one in suspected:
         for k, name in enumerate(names):
             share, error = (x[k] / size[k] if size[k] > 0 else 0.0 for x in (one.move, ERRORS * one.stderr))
             if abs(share) > max(error, SHARE):
                 found.setdefault(name, float(share))
             elif error > SHARE:
                 found.setdefault(name, np.nan)
-    hidden = HIDES.get(untagged(_suspected(misfits)[0].group)[0]) if found else None
-    for name, kind in zip(names, kinds, strict=False):
-        if kind == hidden:
-            found.setdefault(name, np.nan)
-    return found
+    if not suspected:
+        return found
+    best, moves = suspected[0], bool(found)
+    reach, hidden = known.within_reach(best, size), HIDES.get(untagged(best.group)[0])
+    hides = np.array([kind == hidden for kind in kinds], bool) if kinds else np.zeros(len(names), bool)
+    may_be_off = hides & (moves | reach | known.depend(len(names)))
+    return found | {name: np.nan for name, may in zip(names, may_be_off, strict=True) if may and name not in found}
 
 
-def _suspected(misfits: Sequence[Misfit]) -> list[Misfit]:
+def _clear(misfits: Sequence[Misfit]) -> list[Misfit]:
     """Of every joint the group that explains most, and those that explain nearly as much; what explains less is not
     needed, nor what explains less than idle columns would."""
     found = [one for one in significant(misfits) if one.evidence > 0]
     most = {untagged(one.group)[1]: one.evidence for one in reversed(found)}
     return [one for one in found if one.evidence >= ALIKE * most[untagged(one.group)[1]]]
+
+
+def _suspected(misfits: Sequence[Misfit]) -> list[Misfit]:
+    """Those that are clear; where none is, but one is significant, the one that good data would show most rarely."""
+    return _clear(misfits) or sorted(significant(misfits), key=lambda one: one.p)[:1]
 
 
 def culprits(misfits: Sequence[Misfit]) -> str:
@@ -276,10 +315,12 @@ def culprits(misfits: Sequence[Misfit]) -> str:
 
 def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     """Why these parameters cannot be trusted; empty where none is off."""
+    if not off:
+        return ""
     changes = [f"{name} would change by {share:+.0%}" for name, share in off.items() if np.isfinite(share)]
     open_ones = [name for name, share in off.items() if not np.isfinite(share)]
     changes += [f"how far {listed(open_ones)} would change cannot be told"] if open_ones else []
-    return f"the model lacks {culprits(misfits)}: {', '.join(changes)}" if off else ""
+    return f"the model lacks {culprits(misfits)}: {', '.join(changes)}"
 
 
 def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str], ordinary: bool = False) -> dict[str, str]:
@@ -304,22 +345,33 @@ def missing(misfits: Sequence[Misfit], off: Mapping[str, float]) -> tuple[str, s
     return (in_words(misfits, off), remedy(_suspected(misfits)[0].group)) if off else ("", "")
 
 
-def harmless(misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()) -> str:
+def harmless(
+    misfits: Sequence[Misfit],
+    names: Sequence[str],
+    size: Numbers,
+    kinds: Sequence[str] = (),
+    known: Known = NOTHING_KNOWN,
+) -> str:
     """What is missing, but moves no parameter beyond error and `SHARE` if it is that: a note."""
-    if not _suspected(misfits) or off_by(misfits, names, size, kinds):
+    if not _suspected(misfits) or off_by(misfits, names, size, kinds, known):
         return ""
+    looks = f"the model lacks something, which looks like {culprits(misfits)}"
     return (
-        f"the model lacks something, which looks like {culprits(misfits)}; if it is that, no parameter is off by more "
-        f"than {SHARE:.0%} or beyond error; if it is something else, how far they are off cannot be told"
+        f"{looks}; if it is that, no parameter is off by more than {SHARE:.0%} or beyond error; if it is something "
+        "else, how far they are off cannot be told"
     )
 
 
 def open_moves(
-    misfits: Sequence[Misfit], names: Sequence[str], size: Numbers, kinds: Sequence[str] = ()
+    misfits: Sequence[Misfit],
+    names: Sequence[str],
+    size: Numbers,
+    kinds: Sequence[str] = (),
+    known: Known = NOTHING_KNOWN,
 ) -> tuple[Numbers, str]:
     """(p,) by how much parameters that stay trusted are off if it is one of the suspects, which is not certain: the
     largest move beyond its error; and a note on that."""
-    off, moves = off_by(misfits, names, size, kinds), np.zeros(len(names))
+    off, moves = off_by(misfits, names, size, kinds, known), np.zeros(len(names))
     for one in _suspected(misfits):
         moves = np.maximum(moves, np.where(np.abs(one.move) > ERRORS * one.stderr, np.abs(one.move), 0))
     moves = np.where([name in off for name in names], 0, moves)

@@ -164,7 +164,7 @@ def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
         group=name,
         p=float(fdtrc(k, freedom - k, statistic / k)),
         statistic=statistic,
-        evidence=statistic - k * np.log(freedom),
+        evidence=statistic - k * float(np.log(freedom)),
         weights=kept @ weights / size,
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),

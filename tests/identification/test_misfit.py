@@ -12,8 +12,8 @@ import pytest
 
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
-from jaximp.identification.misfit import harmless, in_words, off_by, open_moves, unnoticed
-from jaximp.trust.score_tests import FAMILYWISE, Misfit, significant
+from jaximp.identification.misfit import Known, harmless, in_words, off_by, open_moves, unnoticed
+from jaximp.trust.score_tests import FAMILYWISE, Bands, Misfit, significant
 from jaximp.trust.window_rules import NOTHING_MISSING
 
 RECORDS, SECONDS, RATE = 12, 40.0, 200.0
@@ -113,6 +113,28 @@ def test_what_yields_hides_how_stiff_the_joint_is() -> None:
     assert in_words([lag], off).endswith("inertia would change by +14%, how far stiffness would change cannot be told")
     late = found("delay", [0.14, -0.01, 0.0], [0.01, 0.001, 0.0], evidence=110)
     assert "stiffness" not in off_by([lag, late], *NAMED)
+
+
+def test_what_yields_hides_the_stiffness_unless_its_size_and_the_frequencies_bound_it() -> None:
+    lag = found("lag", [0.01, 0.0, 0.0], [0.001, 0.001, 0.001])  # of a chi-squared of 110
+    small, large = Known(np.array([0.01, 0.01, 0.004])), Known(np.array([0.001, 0.001, 0.006]))
+    assert off_by([lag], *NAMED, small) == {}  # 4.2 %, if all of it looked like stiffness
+    assert set(off_by([lag], *NAMED, large)) == {"stiffness"}
+    delay = found("delay", [0.01, 0.0, 0.0], [0.001, 0.001, 0.001])
+    assert off_by([delay], *NAMED, large) == {}
+    ordinary, same = np.array([1.0, 0.9, 0.98]), np.ones(3)
+    for error, hidden in ((0.015, set()), (0.009, {"stiffness"})):
+        bands = Bands(ordinary, same, np.array([1.0, 1.0, error]), same)
+        assert set(off_by([lag], *NAMED, replace(small, bands=bands))) == hidden
+    assert harmless([lag], *NAMED, small)
+    assert not harmless([lag], *NAMED, large)
+
+
+@pytest.mark.parametrize("wrong", ["skin slips 15 % below 3 Hz", "30 % relaxes in 500 ms"])
+def test_a_lag_that_moves_nothing_else_hides_the_stiffness(ankles: ModuleType, wrong: str) -> None:
+    estimates = identified(ankles, wrong, records=4, seconds=60.0)
+    assert all(np.abs(np.median(one.value[:, 2]) / ankles.TRUTH["stiffness"] - 1) > 0.05 for one in estimates)
+    assert np.mean([one.trusted_in("stiffness").mean() for one in estimates]) < 0.2
 
 
 def test_the_delay_that_would_go_unnoticed_is_said_with_what_yields_as_much() -> None:
