@@ -258,6 +258,17 @@ def relaxing(share: float, seconds: float) -> Wrong:
     return Wrong(lambda motion: motion.through(response), ("lag",))
 
 
+def softer(share: float) -> Wrong:
+    """The stiffness falls with the speed; no suspect is that."""
+
+    def torque(motion: Motion) -> Numbers:
+        speed = np.abs(motion.velocity)
+        stiffness = STIFFNESS * (1 - share * speed / (speed + speed.std()))
+        return motion.through(lambda s: INERTIA * s**2 + DAMPING * s) + stiffness * motion.position
+
+    return Wrong(torque, ())
+
+
 WRONG: Mapping[str, Wrong] = {
     "weak reflex, 1 N m s/rad": reflex(1.0),
     "strong reflex, 4 N m s/rad": reflex(4.0),
@@ -278,6 +289,7 @@ WRONG: Mapping[str, Wrong] = {
     "skin slips 15 % below 3 Hz": slipping(0.15, 3.0),
     "30 % relaxes in 100 ms": relaxing(0.3, 0.1),
     "30 % relaxes in 500 ms": relaxing(0.3, 0.5),
+    "stiffness falls with speed": softer(0.5),
 }
 
 

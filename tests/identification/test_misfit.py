@@ -177,6 +177,36 @@ def test_a_move_that_is_not_determined_spares_nothing() -> None:
     assert harmless([small], *NAMED).endswith("if it is something else, how far they are off cannot be told")
 
 
+def test_parameters_are_spared_only_by_a_suspect_that_explains_all() -> None:
+    friction = found("friction", [0.0, 0.3, 0.01], [0.001, 0.02, 0.001])
+    assert set(off_by([replace(friction, left=9.0)], *NAMED)) == {"damping"}
+    off = off_by([replace(friction, left=11.0)], *NAMED)
+    assert off["damping"] == pytest.approx(0.3)
+    assert np.isnan([off["inertia"], off["stiffness"]]).all()
+    assert in_words([replace(friction, left=11.0)], off).startswith("the model lacks dry friction, and more than that:")
+
+
+def test_a_small_misfit_that_no_suspect_explains_refuses_what_it_could_move() -> None:
+    small = replace(found("friction", [0.01, 0.01, 0.01], [0.001, 0.001, 0.001]), left=50.0)
+    known = Known(np.array([0.001, 0.004, 0.006]))  # times the root of 110
+    assert list(off_by([small], *NAMED, known)) == ["stiffness"]
+    assert off_by([replace(small, left=0.0)], *NAMED, known) == {}
+    assert harmless([small], *NAMED).endswith(
+        "is more than that; it is small, but how far parameters are off cannot be told"
+    )
+
+
+def test_of_suspects_that_look_alike_the_one_that_explains_all_is_named() -> None:
+    alike = replace(found("inertia", [0.3, 0.0, 0.0], [0.01, 0.001, 0.001], evidence=101), left=150.0)
+    right = found("stiffness", [0.0, 0.0, 0.2], [0.001, 0.001, 0.01], evidence=100)
+    assert set(off_by([alike, right], *NAMED)) == {"stiffness"}
+
+
+def test_a_stiffness_that_falls_with_the_speed_is_no_suspects_and_spares_nothing(ankles: ModuleType) -> None:
+    estimates = identified(ankles, "stiffness falls with speed", records=4, seconds=60.0)
+    assert np.mean([one.trusted_in("stiffness").mean() for one in estimates]) < 0.5
+
+
 def test_what_may_be_missing_widens_the_errors_of_what_stays_trusted() -> None:
     late = found("delay", [0.04, -0.2, 0.01], [0.005, 0.01, 0.02], evidence=110)
     lag = found("lag", [-0.045, 0.0, 0.0], [0.005, 0.01, 0.02])
