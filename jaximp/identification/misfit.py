@@ -30,6 +30,10 @@ from jaximp.models.base import Role
 from jaximp.trust.score_tests import ALIKE, ERRORS, SHARE, Bands, Misfit, noticed, score_groups, significant
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
+LATE = ("delay", "clock")
+"""Their weights are those of a jerk."""
+AT_ENDS = ("clock",)
+"""What moves parameters most in the first and the last window, to both sides, and not on the mean."""
 LEAVES = 0.1
 """A group that explains what is found leaves another one such a share of its own evidence at most: those that are
 right left 6 %, those that only looked like it 10 to 170 %, in simulated records of 60 s."""
@@ -54,9 +58,14 @@ def find_misfits(
         if not has_muscles(pipeline.model) and len(tests.torque) < FEWEST_WINDOWS * tests.window:
             tests = tests.with_other(window=len(tests.torque))
         return tuple(_as_delayed(_one_after_another(tests)))
-    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording))
+    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, theta))
     tests = Tests.of(pipeline, white, rows.valid, groups)
-    return _of_joint(pipeline, _with_left(tests, tests()), theta)
+    return _of_joint(pipeline, _with_left(tests, tests()), theta, _half(pipeline, recording))
+
+
+def _half(pipeline: Pipeline, recording: Recording) -> float:
+    """[s] from the middle of the recording to that of its first window."""
+    return float(recording.time[-1] - recording.time[0] - pipeline.window.length) / 2
 
 
 def _with_left(tests: Tests, found: Sequence[Misfit]) -> list[Misfit]:
@@ -65,9 +74,12 @@ def _with_left(tests: Tests, found: Sequence[Misfit]) -> list[Misfit]:
     return [replace(one, left=tests.left_by(one)) if one.group in suspected else one for one in found]
 
 
-def _of_joint(pipeline: Pipeline, found: Iterable[Misfit], theta: Numbers) -> tuple[Misfit, ...]:
+def _of_joint(pipeline: Pipeline, found: Iterable[Misfit], theta: Numbers, seconds: float) -> tuple[Misfit, ...]:
+    """With the moves by what comes late. **Arguments:** `seconds` from the record's middle to its first window's."""
     roles = pipeline.model.roles
-    return tuple(_as_delayed([_undelayed(one, roles, theta) if is_delay(one.group) else one for one in found]))
+    of_jerk = _as_clocks(list(found), seconds)
+    late = [_undelayed(one, roles, theta) if untagged(one.group)[0] in LATE else one for one in of_jerk]
+    return tuple(_as_delayed(late))
 
 
 @dataclass(frozen=True)
@@ -125,7 +137,7 @@ def find_human_misfits(
     tests = Tests.of(pipeline, found.white, found.valid, groups())
     tested = _with_left(tests, tests())
     own = (replace(one, move=one.move[human], stderr=one.stderr[human]) for one in tested)
-    return _of_joint(pipeline, own, theta)
+    return _of_joint(pipeline, own, theta, _half(pipeline, recording))
 
 
 @dataclass(frozen=True)
@@ -219,6 +231,21 @@ def _as_delayed(misfits: Sequence[Misfit]) -> list[Misfit]:
         replace(one, move=late[one.group].move, stderr=late[one.group].stderr) if one.group in late else one
         for one in misfits
     ]
+
+
+def _as_clocks(misfits: Sequence[Misfit], seconds: float) -> list[Misfit]:
+    """Clocks that drift apart delay the torque at the record's ends, where they move parameters as a delay does."""
+    delays = {one.group.replace("delay", "clock"): one for one in misfits if is_delay(one.group)}
+    return [
+        _as_clock(one, delays[one.group], seconds) if one.group in delays and delays[one.group].weights[0] else one
+        for one in misfits
+    ]
+
+
+def _as_clock(clock: Misfit, delay: Misfit, seconds: float) -> Misfit:
+    passed = delay.move * seconds / delay.weights[0]
+    move, stderr = passed * clock.weights[0], np.abs(passed) * clock.weights_stderr[0]
+    return replace(clock, weights=clock.weights * seconds, move=move, stderr=stderr)
 
 
 def _undelayed(misfit: Misfit, roles: Sequence[Role], theta: Numbers) -> Misfit:
@@ -343,11 +370,17 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     if not off:
         return ""
     best = _suspected(misfits)[0]
-    changes = [f"{name} would change by {share:+.0%}" for name, share in off.items() if np.isfinite(share)]
+    changes = [f"{name} would change by {_by(best, share)}" for name, share in off.items() if np.isfinite(share)]
     open_ones = [name for name, share in off.items() if not np.isfinite(share)]
     changes += [f"how far {listed(open_ones)} would change cannot be told"] if open_ones else []
     more = "" if explains(best) else ", and more than that"
     return f"the model lacks {culprits(misfits)}{more}: {', '.join(changes)}"
+
+
+def _by(misfit: Misfit, share: float) -> str:
+    if untagged(misfit.group)[0] in AT_ENDS:
+        return f"up to {abs(share):.0%} at the ends of the record"
+    return f"{share:+.0%}"
 
 
 def by_bands(bands: Bands | None, names: Sequence[str], units: Sequence[str], ordinary: bool = False) -> dict[str, str]:

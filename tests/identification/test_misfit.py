@@ -64,8 +64,10 @@ def changes(ankles: ModuleType, estimates: Sequence[Estimates], name: str) -> tu
         ("torque 5 ms late", "a delay between torque and position", "inertia", "stiffness"),
         ("cubic stiffness, +30 %", "a stiffness that depends on the angle", "stiffness", "damping"),
         ("backlash of 0.02 rad", "play (backlash) between position and torque", "damping", ""),
+        ("sensor saturates softly, 2.5 sd", "a torque sensor whose scale is not constant", "stiffness", ""),
+        ("inertia by angle, +20 %", "an inertia that depends on the angle", "inertia", "damping"),
     ],
-    ids=["reflex", "friction", "delay", "cubic", "backlash"],
+    ids=["reflex", "friction", "delay", "cubic", "backlash", "sensor", "inertia"],
 )
 def test_what_is_missing_is_found_and_named(ankles: ModuleType, wrong: str, words: str, off: str, spared: str) -> None:
     estimates = identified(ankles, wrong)
@@ -77,6 +79,19 @@ def test_what_is_missing_is_found_and_named(ankles: ModuleType, wrong: str, word
     said, needed, error = changes(ankles, estimates, off)
     assert said * needed > 0
     assert said == pytest.approx(needed, abs=3.5 * error + 0.3 * abs(needed))
+
+
+def test_clocks_that_drift_apart_are_judged_by_the_ends_of_the_record(ankles: ModuleType) -> None:
+    """On the mean over the record they move nothing."""
+    estimates = identified(ankles, "clocks 100 ppm apart", records=4, seconds=60.0)
+    for one in estimates:
+        assert np.mean(one.value[:, 0]) == pytest.approx(ankles.TRUTH["inertia"], rel=0.03)
+        (clock,) = (test for test in one.misfits if test.group == "clock")
+        # the delay of the first window, 100 ppm of 29 s, times the inertia
+        assert np.abs(clock.weights[0]) / ankles.TRUTH["inertia"] == pytest.approx(29e-4, rel=0.35)
+        assert "clocks of position and torque that drift apart: inertia would change by up to" in one.lacking["inertia"]
+        assert "at the ends of the record" in one.lacking["inertia"]
+        assert one.trusted_in("stiffness").all()
 
 
 def test_without_the_noise_nothing_is_tested_and_a_wrong_model_trusted(ankles: ModuleType) -> None:
