@@ -312,8 +312,8 @@ def off_by(
     """Parameters that what is missing moves beyond error and `SHARE` of their `size` (p,), by what share; NaN where it
     may move them so far, but how far cannot be told.
 
-    What hides a parameter leaves it only where it is small, and the parameter does not depend on the frequency. And
-    where no suspect explains what is found, none says which parameters it spares.
+    A parameter that the best suspect hides is spared only where as much torque could not move it far, and where it does
+    not depend on the frequency. Where no suspect explains what is found, none says which parameters it spares.
 
     **Arguments:** `kinds` (p,) of the parameters' roles; what is `known` of moves that no column shows.
     """
