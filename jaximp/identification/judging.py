@@ -268,9 +268,10 @@ class _OfModel:
 
 
 def _error_of_mean(stderr: Numbers) -> Numbers:
-    """(p,) of the parameters' mean over windows that share no rows, by their standard errors (K, p)."""
+    """(p,) of the parameters' mean over windows that share no rows, by their standard errors (K, p); windows that
+    hardly move do not count, if they are fewer than half."""
     known = stderr[np.isfinite(stderr).all(axis=1)]
-    return np.sqrt((known**2).sum(axis=0)) / max(len(known), 1)
+    return np.median(known, axis=0) / np.sqrt(len(known)) if len(known) else np.zeros(stderr.shape[1])
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

@@ -40,6 +40,10 @@ right left 6 %, those that only looked like it 10 to 170 %, in simulated records
 HIDES = {"lag": "stiffness"}
 """Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
 
+FAINT = 0.01
+"""Where another weight of the frequencies alone moves a parameter by such a share, what is hidden may move it by
+`SHARE`: stiffness that relaxes mostly below the motion's frequencies does."""
+
 
 FEWEST_WINDOWS = 6
 """In a shorter record a machine's parameters are taken as those of the record: windows with parameters of their own
@@ -293,10 +297,11 @@ class Known:
         return np.sqrt(misfit.statistic) * self.errors > SHARE * size
 
     def depend(self, count: int) -> NDArray[np.bool_]:
-        """(p,) of so many parameters those that differ, beyond error, with the frequencies that count."""
+        """(p,) of so many parameters those that differ with the frequencies that count, beyond error and `FAINT`."""
         if self.bands is None:
             return np.zeros(count, bool)
-        return np.abs(self.bands.ordinary - self.bands.generalised) > ERRORS * self.bands.stderr
+        difference = np.abs(self.bands.ordinary - self.bands.generalised)
+        return difference > np.maximum(ERRORS * self.bands.stderr, FAINT * np.abs(self.bands.generalised))
 
 
 NOTHING_KNOWN = Known()

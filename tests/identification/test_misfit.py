@@ -141,6 +141,8 @@ def test_what_yields_hides_the_stiffness_unless_its_size_and_the_frequencies_bou
     for error, hidden in ((0.015, set()), (0.009, {"stiffness"})):
         bands = Bands(ordinary, same, np.array([1.0, 1.0, error]), same)
         assert set(off_by([lag], *NAMED, replace(small, bands=bands))) == hidden
+    faint = Bands(np.array([1.0, 1.0, 0.992]), same, np.full(3, 1e-3), same)
+    assert off_by([lag], *NAMED, replace(small, bands=faint)) == {}
     assert harmless([lag], *NAMED, small)
     assert not harmless([lag], *NAMED, large)
 
