@@ -246,6 +246,62 @@ def backlash(play: float) -> Wrong:
     return Wrong(torque, ("play",))
 
 
+def saturating(deviations: float) -> Wrong:
+    """The sensor reads no more than so many standard deviations of the torque, and less and less up to there."""
+
+    def torque(motion: Motion) -> Numbers:
+        true = motion.through(impedance) + OFFSET
+        most = deviations * true.std()
+        return most * np.tanh(true / most) - OFFSET
+
+    return Wrong(torque, ("sensor",))
+
+
+def apart(share: float) -> Wrong:
+    """The clock of the torque is fast by a share, and right in the middle of the record."""
+
+    def torque(motion: Motion) -> Numbers:
+        from scipy.interpolate import CubicSpline
+
+        t = (np.arange(motion.samples) - motion.samples / 2) / motion.rate
+        return np.asarray(CubicSpline(t, motion.through(impedance))(t * (1 + share)))
+
+    return Wrong(torque, ("clock",))
+
+
+def heavier(share: float) -> Wrong:
+    """The inertia grows by a share at one standard deviation from the middle, with its centripetal torque."""
+
+    def torque(motion: Motion) -> Numbers:
+        q, dq, ddq = motion.position, motion.velocity, motion.through(lambda s: s**2)
+        return motion.through(impedance) + INERTIA * share / SIZE**2 * (q**2 * ddq + q * dq**2)
+
+    return Wrong(torque, ("inertia",))
+
+
+def slipping(share: float, frequency: float) -> Wrong:
+    """A marker on the skin, which follows slow motion less by a share, below some frequency [Hz]."""
+    response = lambda s: impedance(s) / (1 - share / (1 + s / (2 * np.pi * frequency)))  # noqa: E731
+    return Wrong(lambda motion: motion.through(response), ("lag",))
+
+
+def relaxing(share: float, seconds: float) -> Wrong:
+    """Fast motion meets a further share of the stiffness, which relaxes (Maxwell)."""
+    response = lambda s: impedance(s) + share * STIFFNESS * s * seconds / (1 + s * seconds)  # noqa: E731
+    return Wrong(lambda motion: motion.through(response), ("lag",))
+
+
+def softer(share: float) -> Wrong:
+    """The stiffness falls with the speed; no suspect is that."""
+
+    def torque(motion: Motion) -> Numbers:
+        speed = np.abs(motion.velocity)
+        stiffness = STIFFNESS * (1 - share * speed / (speed + speed.std()))
+        return motion.through(lambda s: INERTIA * s**2 + DAMPING * s) + stiffness * motion.position
+
+    return Wrong(torque, ())
+
+
 WRONG: Mapping[str, Wrong] = {
     "weak reflex, 1 N m s/rad": reflex(1.0),
     "strong reflex, 4 N m s/rad": reflex(4.0),
@@ -263,6 +319,13 @@ WRONG: Mapping[str, Wrong] = {
     "cuff of 1250 N m/rad": cuff(1250.0),
     "second mode at 12 Hz": second_mode(),
     "backlash of 0.02 rad": backlash(0.02),
+    "sensor saturates softly, 2.5 sd": saturating(2.5),
+    "clocks 100 ppm apart": apart(1e-4),
+    "inertia by angle, +20 %": heavier(0.2),
+    "skin slips 15 % below 3 Hz": slipping(0.15, 3.0),
+    "30 % relaxes in 100 ms": relaxing(0.3, 0.1),
+    "30 % relaxes in 500 ms": relaxing(0.3, 0.5),
+    "stiffness falls with speed": softer(0.5),
 }
 
 

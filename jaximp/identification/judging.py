@@ -14,7 +14,18 @@ from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
-from jaximp.identification.misfit import by_bands, harmless, in_words, is_delay, missing, off_by, sizes, unnoticed
+from jaximp.identification.misfit import (
+    Known,
+    by_bands,
+    harmless,
+    in_words,
+    is_delay,
+    missing,
+    off_by,
+    open_moves,
+    sizes,
+    unnoticed,
+)
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.regression import Rows
@@ -58,6 +69,7 @@ def judge(
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
     of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary, weights)
+    sure, fit = fit, _with_open_moves(fit, of_model.moves)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
@@ -76,7 +88,7 @@ def judge(
         _delay(prepared, rows, misfits),
         *notes,
     )
-    changed = changes(pipeline, fit, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
+    changed = changes(pipeline, sure, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -124,6 +136,13 @@ def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement
         return fit
     solved = rows if prepared.pipeline.ordinary else prepared.white[0]
     return corrected(fit, solved.W, solved.noisy, rows.valid, _apart(place))
+
+
+def _with_open_moves(fit: SlidingFit, moves: Numbers) -> SlidingFit:
+    """With standard errors that hold what cannot be excluded; it is the same in all windows, and no sign of change."""
+    if not moves.any():
+        return fit
+    return eqx.tree_at(lambda f: f.stderr, fit, jnp.sqrt(jnp.asarray(fit.stderr) ** 2 + moves**2))
 
 
 def _held_out(solved: Solved) -> NDArray[np.float64]:
@@ -212,7 +231,9 @@ class _OfModel:
     lacking: dict[str, str]
     """Why each parameter cannot be trusted."""
     bands: Bands | None
-    notes: tuple[str, str]
+    moves: Numbers
+    """(p,) by how much parameters that stay trusted may be off, in every window alike."""
+    notes: tuple[str, ...]
 
     @classmethod
     def of(
@@ -227,19 +248,30 @@ class _OfModel:
     ) -> _OfModel:
         """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not; `weights` of a
         reflex, of which nothing is said one by one."""
-        theta = np.asarray(solved.fit.theta)
+        apart, bands = _apart(place), None
+        theta, stderr = (np.asarray(x) for x in (solved.fit.theta, solved.fit.stderr))
         size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
-        tests = (misfits, model.names, size, [role.kind for role in model.roles])
-        off, bands = off_by(*tests), None
-        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
         if solved.beside is not None and misfits:
-            both = np.asarray(solved.beside.theta)[:: _apart(place)], theta[:: _apart(place)]
+            both = np.asarray(solved.beside.theta)[::apart], theta[::apart]
             bands = compare_bands(*(both[::-1] if ordinary else both))
+        tests = (misfits, model.names, size, [role.kind for role in model.roles])
+        known = Known(_error_of_mean(stderr[::apart]), bands)
+        off = off_by(*tests, known)
+        why, remedy = missing(misfits, {name: share for name, share in off.items() if name in judged})
         lacking = by_bands(bands, model.names, model.units, ordinary)
         others = [text for name, text in lacking.items() if name in judged and name not in off]
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
-        return cls(why, remedy, lacking, bands, (harmless(*tests), unnoticed(*tests, spared=weights)))
+        moves, grown = open_moves(*tests, known) if misfits else (np.zeros(len(model.names)), "")
+        notes = (harmless(*tests, known), grown, unnoticed(*tests, spared=weights))
+        return cls(why, remedy, lacking, bands, moves, notes)
+
+
+def _error_of_mean(stderr: Numbers) -> Numbers:
+    """(p,) of the parameters' mean over windows that share no rows, by their standard errors (K, p); windows that
+    hardly move do not count, if they are fewer than half."""
+    known = stderr[np.isfinite(stderr).all(axis=1)]
+    return np.median(known, axis=0) / np.sqrt(len(known)) if len(known) else np.zeros(stderr.shape[1])
 
 
 def _reflex(model: Model, fit: SlidingFit, gain: SlidingFit) -> Reflex:

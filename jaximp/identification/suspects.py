@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -39,6 +39,8 @@ class Motion:
     jerk: Numbers
     snap: Numbers
     rate: float
+    torque: Numbers
+    """That of the model; nothing where its parameters are not known."""
 
     def later(self, x: Numbers, seconds: float) -> Numbers:
         """What x was so long ago."""
@@ -123,6 +125,21 @@ SUSPECTS: Mapping[str, Suspect] = {
         "something that yields or filters between position and torque (a cuff, an amplifier), or noise of the position",
         "measure the position where the torque acts, and use one filter for both channels",
         lambda m: [m.snap, *(yielding(m.ddq, seconds, m.rate) for seconds in YIELDING)],
+    ),
+    "clock": Suspect(
+        "clocks of position and torque that drift apart",
+        "sample both channels by one clock, or resample one of them to the clock of the other",
+        lambda m: [(m.t - m.t.mean()) * m.jerk],
+    ),
+    "inertia": Suspect(
+        "an inertia that depends on the angle",
+        "move less far, or around one angle at a time",
+        lambda m: [(q := m.q - m.q.mean()) ** 2 * m.ddq + q * m.dq**2, q * m.ddq + m.dq**2 / 2],
+    ),
+    "sensor": Suspect(
+        "a torque sensor whose scale is not constant (soft saturation)",
+        "calibrate the sensor and its amplifier over the range of the torques, or use less of it",
+        lambda m: [m.torque**2, m.torque**3],
     ),
     "drift": Suspect(
         "a steady change inside the windows",
@@ -239,11 +256,21 @@ def has_muscles(model: Model) -> bool:
     return any(role.kind == "stiffness" for role in model.roles)
 
 
-def of_one_joint(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, Numbers]]:
-    """Columns (N, g) of all `SUSPECTS` that a joint like the model's may have, behind the filters."""
-    (motion,) = motions(pipeline, recording)
-    muscles = has_muscles(pipeline.model)
-    asked = {name: one for name, one in SUSPECTS.items() if muscles or name not in OF_MUSCLES}
+def of_one_joint(
+    pipeline: Pipeline, recording: Recording, theta: Numbers | None = None
+) -> Iterator[tuple[str, Numbers]]:
+    """Columns (N, g) of all `SUSPECTS` that a joint like the model's may have, behind the filters.
+
+    **Arguments:** parameters `theta` (p,), near which it lies; without them the torque's sensor is not asked.
+    """
+    (motion,), model = motions(pipeline, recording), pipeline.model
+    left_out = set() if has_muscles(model) else set(OF_MUSCLES)
+    if theta is None:
+        left_out.add("sensor")
+    else:
+        W = model.over_period(motion.q, motion.dq, motion.ddq, motion.rate)
+        motion = replace(motion, torque=np.asarray(W) @ theta)
+    asked = {name: one for name, one in SUSPECTS.items() if name not in left_out}
     by_group = [suspect.columns(motion) for suspect in asked.values()]
     together = behind_filters(pipeline.filters, [column for group in by_group for column in group])
     ends = np.cumsum([len(group) for group in by_group])
@@ -296,7 +323,7 @@ def motions(pipeline: Pipeline, recording: Recording) -> list[Motion]:
             q = sosfiltfilt(np.array(filters.position), q)
         dq, ddq = signals.differentiate(q, rate, filters.differentiator)
         jerk, snap = signals.differentiate(ddq, rate, filters.differentiator)
-        found.append(Motion(recording.time, q, dq, ddq, jerk, snap, rate))
+        found.append(Motion(recording.time, q, dq, ddq, jerk, snap, rate, np.empty(0)))
     return found
 
 

@@ -51,6 +51,8 @@ class Misfit:
     """(p,) of that."""
     weights_stderr: Numbers
     """(g,)"""
+    left: float = 0.0
+    """Most evidence of another group that is significant with this one in the model; zero where this explains all."""
 
 
 class _Sums(NamedTuple):
@@ -78,13 +80,15 @@ def score_groups(
     every: int = 1,
     fit: DisjointFit | None = None,
     moved_in: tuple[Numbers, Mapping[str, Numbers]] | None = None,
+    beside: str = "",
 ) -> list[Misfit]:
     """Test every group of added columns.
 
     **Arguments:** `W` (N, p) and `y` (N,) rows whose noise is white; `groups` of further columns (N, g) that went
     through the same filters; `valid` (N,); `window` rows side by side, of which `every` neighbours say as much as one;
     `fit` of W and y in these windows, where it is known: rows that do not count are zero then, in all columns;
-    `moved_in` columns (N, p) and groups in rows by which the parameters move, where these are not the white ones.
+    `moved_in` columns (N, p) and groups in rows by which the parameters move, where these are not the white ones;
+    `beside` a group that is in the model, and is not tested, where `y` is without what it explains.
 
     **Source:** score test with a covariance that knows nothing of the noise's size row by row (White 1980; residuals
     scaled by their leverage).
@@ -98,10 +102,11 @@ def score_groups(
         columns, others = moved_in
         passed = _passed(columns, [others[name] for name in groups], window, with_say(fit, every))
         sums = sums._replace(passed=passed)
-    found, first = [], 0
-    for name, columns in groups.items():
-        own = slice(first, first := first + columns.shape[1])
-        found.append(_test(name, sums, own))
+    ends = np.cumsum([columns.shape[1] for columns in groups.values()]).tolist()
+    places = {name: slice(*ends) for name, ends in zip(groups, zip([0, *ends], ends, strict=False), strict=True)}
+    if beside:
+        sums = _given(sums, places.pop(beside))
+    found = [_test(name, sums, own) for name, own in places.items()]
     return [one for one in found if one is not None]
 
 
@@ -137,6 +142,16 @@ def _sums(W: Numbers, groups: Sequence[Numbers], fit: DisjointFit, every: int) -
     return _Sums(gram, spread, score, passed, np.sqrt(size), float(freedom.sum()))
 
 
+def _given(sums: _Sums, own: slice) -> _Sums:
+    """With some of the columns in the model: less what they say of all others (Frisch, Waugh and Lovell)."""
+    size = np.where(sums.size[own] > 0, sums.size[own], 1)
+    inverse = np.linalg.pinv(sums.gram[own, own] / size / size[:, None], rcond=LOST, hermitian=True)
+    rest = np.eye(len(sums.size))
+    rest[:, own] -= sums.gram[:, own] @ (inverse / size / size[:, None])
+    gram, spread = (rest @ x @ rest.T for x in (sums.gram, sums.spread))
+    return sums._replace(gram=gram, spread=spread, score=rest @ sums.score, passed=sums.passed @ rest.T)
+
+
 def _passed(W: Numbers, groups: Sequence[Numbers], window: int, chosen: NDArray[np.int64]) -> Numbers:
     """(p, G) what each column adds to the parameters by least squares of these rows, on the mean over some windows."""
     z = np.concatenate(groups, axis=1)
@@ -164,7 +179,7 @@ def _test(name: str, sums: _Sums, own: slice) -> Misfit | None:
         group=name,
         p=float(fdtrc(k, freedom - k, statistic / k)),
         statistic=statistic,
-        evidence=statistic - k * np.log(freedom),
+        evidence=statistic - k * float(np.log(freedom)),
         weights=kept @ weights / size,
         move=-passed @ weights,
         stderr=np.sqrt(np.einsum("ij,jk,ik->i", passed, covariance, passed)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.suspects import behind_play, of_one_joint
+from jaximp.identification.suspects import behind_filters, behind_play, motions, of_one_joint
 from jaximp.models import RobotJoint
 
 
@@ -31,3 +31,14 @@ def test_a_machine_without_muscles_is_asked_for_no_reflex(ankles: ModuleType) ->
     assert set(of_joint) - set(of_machine) == {"reflex", "stiffness", "play"}
     for name, columns in of_machine.items():
         np.testing.assert_allclose(columns, of_joint[name], rtol=1e-9)
+
+
+def test_the_sensor_is_asked_by_the_torque_of_the_model(ankles: ModuleType) -> None:
+    recording, joint = ankles.record(np.random.default_rng(2), rate=200.0, seconds=10.0), ankles.pipeline(200.0)
+    asked, theta = dict(of_one_joint(joint, recording)), np.array([*ankles.TRUTH.values()])
+    known = dict(of_one_joint(joint, recording, theta))
+    assert set(known) - set(asked) == {"sensor"}
+    (motion,) = motions(joint, recording)
+    torque = np.stack([motion.ddq, motion.dq, motion.q, np.ones_like(motion.q)], axis=1) @ theta
+    expected = behind_filters(joint.filters, [torque**2, torque**3])
+    np.testing.assert_allclose(known["sensor"], expected, rtol=1e-9, atol=1e-9)

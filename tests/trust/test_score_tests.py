@@ -56,6 +56,18 @@ def test_weights_and_moves_are_those_of_the_fit_with_the_columns(every: int) -> 
     np.testing.assert_allclose(found.stderr, np.sqrt(np.diag(passed @ covariance @ passed.T)), rtol=1e-8)
 
 
+def test_beside_a_group_others_have_the_weights_of_the_fit_with_both() -> None:
+    W, Z, y = rows(np.random.default_rng(8))
+    y, valid = y + 0.4 * Z[:, 0] + 0.3 * Z[:, 1], np.ones(len(y), bool)
+    groups = {"one": Z[:, :1], "other": Z[:, 1:]}
+    (best, _) = score_groups(W, y, groups, valid, WINDOW)
+    rest = y - groups["one"] @ best.weights
+    (both,) = score_groups(W, rest, {"both": Z}, valid, WINDOW)
+    (other,) = score_groups(W, rest, groups, valid, WINDOW, beside="one")
+    np.testing.assert_allclose(other.weights, both.weights[1:], rtol=1e-8)
+    np.testing.assert_allclose(other.weights_stderr, both.weights_stderr[1:], rtol=1e-8)
+
+
 def test_the_unit_of_a_column_changes_nothing() -> None:
     W, Z, y = rows(np.random.default_rng(2))
     valid = np.ones(len(y), bool)
