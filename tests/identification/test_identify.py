@@ -179,10 +179,12 @@ def test_the_ankle_is_right_but_for_a_reflex(data_folder: Path) -> None:
     assert median["damping"] == pytest.approx(0.62, abs=0.06)
     assert median["inertia"] == pytest.approx(0.0146, abs=0.0006)
     assert np.nanmean(estimates.held_out_vaf) > 0.9
-    assert "a stretch reflex: stiffness would change by -" in estimates.lacking["stiffness"]
+    assert "a stretch reflex" in estimates.lacking["stiffness"]
+    assert "stiffness would change by -" in estimates.lacking["stiffness"]
     assert not estimates.verdicts.trusted.any()
     # Ordinary least squares finds an inertia that is 5 % larger, which is where the verdict draws its line.
-    assert "frequency" in estimates.lacking.get("inertia", "frequency")
+    said = estimates.lacking.get("inertia", "frequency")
+    assert "frequency" in said or "how far inertia would change cannot be told" in said
     for name, mean in zip(estimates.names, estimates.mean_over_trusted(), strict=True):
         assert np.isfinite(mean) == (name not in estimates.lacking) == (estimates.trusted_in(name).mean() > 0.9)
 
