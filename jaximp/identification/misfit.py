@@ -62,7 +62,10 @@ def find_misfits(
         if not has_muscles(pipeline.model) and len(tests.torque) < FEWEST_WINDOWS * tests.window:
             tests = tests.with_other(window=len(tests.torque))
         return tuple(_as_delayed(_one_after_another(tests)))
-    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, theta))
+    counts = np.ravel(rows.valid)
+    W, torque = (np.reshape(x, (len(counts), -1))[counts] for x in (white.W, white.torque))
+    whole = np.linalg.lstsq(W, torque[:, 0])[0]
+    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, whole))
     tests = Tests.of(pipeline, white, rows.valid, groups)
     return _of_joint(pipeline, _with_left(tests, tests()), theta, _half(pipeline, recording))
 
@@ -318,7 +321,7 @@ def off_by(
     may move them so far, but how far cannot be told.
 
     A parameter that the best suspect hides is spared only where as much torque could not move it far, and where it does
-    not depend on the frequency. Where no suspect explains what is found, none says which parameters it spares.
+    not depend on the frequency. Where no suspect explains what is found, all parameters are spared only so.
 
     **Arguments:** `kinds` (p,) of the parameters' roles; what is `known` of moves that no column shows.
     """
@@ -338,7 +341,7 @@ def off_by(
     hides = np.array([kind == hidden for kind in kinds], bool) if kinds else np.zeros(len(names), bool)
     may_be_off = hides & (moves | reach | known.depend(len(names)))
     if not explains(best):
-        may_be_off |= moves | reach
+        may_be_off |= reach
     return found | {name: np.nan for name, may in zip(names, may_be_off, strict=True) if may and name not in found}
 
 
@@ -378,8 +381,8 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     changes = [f"{name} would change by {_by(best, share)}" for name, share in off.items() if np.isfinite(share)]
     open_ones = [name for name, share in off.items() if not np.isfinite(share)]
     changes += [f"how far {listed(open_ones)} would change cannot be told"] if open_ones else []
-    more = "" if explains(best) else ", and more than that"
-    return f"the model lacks {culprits(misfits)}{more}: {', '.join(changes)}"
+    more = "" if explains(best) else "; it lacks more than that"
+    return f"the model lacks {culprits(misfits)}: {', '.join(changes)}{more}"
 
 
 def _by(misfit: Misfit, share: float) -> str:
