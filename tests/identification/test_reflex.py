@@ -430,9 +430,11 @@ def test_the_ankle_with_a_reflex_is_explained_by_one(data_folder: Path) -> None:
     assert held_out["true"] > 0.86
     assert held_out["{ direction = -1 }"] < 0.75
     with_it = found["true"]
-    # The bank of lags leaves something that looks like another reflex, and more: what that does cannot be told.
+    # The bank of lags leaves something that looks like a reflex of another kind and, beside it, like something that
+    # yields, which moves the damping by 9 %: nothing is spared.
     for name in ("inertia", "damping", "stiffness"):
-        assert with_it.trusted_in(name).mean() > 0.8 or "it lacks more than that" in with_it.lacking[name]
+        assert not with_it.trusted_in(name).any()
+        assert f"how far {name} would change cannot be told; it lacks more than that" in with_it.lacking[name]
     inertia, damping, stiffness = np.nanmedian(with_it.value, axis=0)[:3]
     assert inertia == pytest.approx(0.0158, rel=0.06)
     assert damping == pytest.approx(0.70, rel=0.15)
