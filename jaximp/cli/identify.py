@@ -53,7 +53,9 @@ def identify_into(job: Job, folder: Path) -> None:
         others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
 
-        write_results(folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, prepared.recording)
+        write_results(
+            folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, prepared.recording
+        )
         progress(1.0)
     _say_result(estimates[0])
 

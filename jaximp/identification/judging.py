@@ -169,8 +169,12 @@ def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str]) -> list[st
 
 
 def _delay(prepared: Prepared, rows: Rows, misfits: tuple[Misfit, ...]) -> str:
-    """How long a delay is, if what the model lacks is one."""
-    if len(prepared.white) != 1 or not any(is_delay(one.group) for one in significant(misfits)):
+    """How long a delay of one joint is, if that is what the model lacks."""
+    if (
+        len(prepared.white) != 1
+        or prepared.model.n_joints > 1
+        or not any(is_delay(one.group) for one in significant(misfits))
+    ):
         return ""
     found = find_delay(prepared.pipeline, rows)
     if not found.certain:

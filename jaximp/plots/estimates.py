@@ -285,6 +285,8 @@ def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tup
     """What to write beside a parameter's panel, and in which colour."""
     if not estimates.trusted_in(estimates.names[k]).any():
         return "none trusted" if brief else "no window can be trusted", VERMILLION
+    if estimates.names[k] in estimates.changed:
+        return estimates.changed[estimates.names[k]].split(f" {estimates.units[k]}")[0], BLUE
     return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
 
 
