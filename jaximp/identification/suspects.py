@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from jax import Array
 
 from jaximp import signals
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import measured_motion
 from jaximp.models.base import Model
+from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray, Numbers, Recording
 
 REFLEX_DELAY, MUSCLE = 0.03, (0.0, 0.015, 0.03, 0.06, 0.12)
@@ -24,6 +27,8 @@ YIELDING = (0.01, 0.04)
 """Time constants of what yields between the position and the torque [s]."""
 PLAYS = (0.1, 0.25, 0.6)
 """Half widths of plays, as shares of the root mean square of the motion."""
+PIECE = 4096
+"""Samples whose torque is worked out at once."""
 WIDEST_BAND = 0.9
 """Of derivatives of rows, as a share of half their rate."""
 
@@ -268,13 +273,27 @@ def of_one_joint(
     if theta is None:
         left_out.add("sensor")
     else:
-        W = model.over_period(motion.q, motion.dq, motion.ddq, motion.rate)
-        motion = replace(motion, torque=np.asarray(W) @ theta)
+        motion = replace(motion, torque=_torque(model, motion, theta))
     asked = {name: one for name, one in SUSPECTS.items() if name not in left_out}
     by_group = [suspect.columns(motion) for suspect in asked.values()]
     together = behind_filters(pipeline.filters, [column for group in by_group for column in group])
     ends = np.cumsum([len(group) for group in by_group])
     yield from zip(asked, np.split(together, ends[:-1], axis=1), strict=True)
+
+
+def _torque(model: Model, motion: Motion, theta: Numbers) -> Numbers:
+    """(N,) that the model makes of a motion. In pieces of one size, so that recordings of any length share a program;
+    before the first sample was, for a model with memory, the end of the recording."""
+    n, past = len(motion.q), model.memory
+    starts = np.arange(0, n, PIECE)
+    index = np.clip(starts[:, None] + np.arange(-past, PIECE), None, n - 1) % n
+    pieces = [_torque_of_piece(model, *(x[k] for x in (motion.q, motion.dq, motion.ddq)), theta) for k in index]
+    return np.concatenate(pieces)[:n]
+
+
+@partial(compiled, static_argnums=0)
+def _torque_of_piece(model: Model, q: Array, dq: Array, ddq: Array, theta: Array) -> Array:
+    return model.observation_matrix(q, dq, ddq)[model.memory :] @ theta
 
 
 def of_arm(

@@ -47,6 +47,8 @@ FADING, OF_LATE = 1e-3, 5e-2
 motion of long ago, stays the best."""
 NO_FREEDOM = 1e-9
 """Share of the weights that residuals must keep."""
+ROUNDING = 1e-15
+"""Share of the torque's square that rounding leaves where the fit is exact."""
 
 
 class RecursiveFit(Fit):
@@ -249,7 +251,8 @@ def _estimate(sums: Rows, p: int, variance: float | Array | None) -> _Now:
     pivots = jnp.stack([row[0] for row in triangle[:p]])
     solvable = (pivots**2 > SINGULAR * jnp.stack([row[0] for row in first[:p]])).all(axis=0)
     theta = substitute(triangle, p)
-    rss = jnp.where(triangle[p][0] > 0, triangle[p][0] ** 2, 0)
+    rss = triangle[p][0] ** 2
+    rss = jnp.where((triangle[p][0] > 0) & (rss > ROUNDING * first[p][0]), rss, 0)
     # What is not solvable must not make derivatives NaN.
     alone = tuple(jnp.where(solvable, row[: p - i], _of_unit(row[: p - i])) for i, row in enumerate(triangle[:p]))
     inverse = keep(inverse_of_rows(alone))

@@ -184,7 +184,7 @@ def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert outcome.exit_status == 0
-    assert 0 < len(compiled) <= 6
+    assert 0 < len(compiled) <= 7  # six sizes, and the torque of a piece
 
 
 def test_what_stops_a_stack_is_said_of_its_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
