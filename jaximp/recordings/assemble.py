@@ -31,25 +31,34 @@ def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...],
     usable = judged.valid & np.isfinite(samples).all(axis=1)
     time, samples, valid, of_sampling = on_uniform_grid(stamps, samples, usable)
     _check_enough(valid)
-    samples = np.where(valid[:, None], samples, np.nan)
     borders = np.cumsum([len(signal.labels) for signal in signals.values()])[:-1]
-    clipped = None
-    if judged.clipped.any():
-        clipped = _frozen(np.interp(time + (signals["torque"].delay or 0), stamps, judged.clipped) > 0.5)
+    clipped = _clipped(time, stamps, judged.clipped, signals["torque"].delay or 0.0)
+    samples = np.where((valid if clipped is None else valid | clipped)[:, None], samples, np.nan)
+    channels = dict(zip(signals, np.split(samples, borders, axis=1), strict=True))
+    if clipped is not None:  # whoever reads what is saved of this recording must find the limits again
+        when = time[clipped] + (signals["torque"].delay or 0.0)
+        channels["torque"][clipped] = np.stack([np.interp(when, stamps, x) for x in signals["torque"].values.T], axis=1)
     stated = signals["position"].noise
     return Recording(
         time=_frozen(time),
         valid=_frozen(valid),
-        **dict(zip(signals, map(_frozen, np.split(samples, borders, axis=1)), strict=True)),
+        **{channel: _frozen(values) for channel, values in channels.items()},
         joints=joints,
         position_noise=_frozen(judged.position_noise),
         stated_noise=None if stated is None else _frozen(np.full(len(joints), stated)),
         delay_unknown=signals["torque"].delay is None,
-        clipped=clipped,
+        clipped=None if clipped is None else _frozen(clipped),
         name=name,
         notes=(*of_sampling, *notes, *(fault.text for fault in judged.faults)),
         faults=judged.faults,
     )
+
+
+def _clipped(
+    time: NDArray[np.float64], stamps: NDArray[np.float64], at_limit: NDArray[np.bool_], delay: float
+) -> NDArray[np.bool_] | None:
+    """(N,) samples of the grid at which the torque, moved by its delay, was at a limit; None if there is none."""
+    return np.interp(time + delay, stamps, at_limit) > 0.5 if at_limit.any() else None
 
 
 def _side_by_side(signals: dict[str, Signal]) -> NDArray[np.float64]:

@@ -20,7 +20,8 @@ def save_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording as CSV or Parquet, by extension; `load_recording` reads it back equal.
 
     Columns: `time_s`, `position_rad` (`position1_rad`, ... for several joints; `_m` if prismatic), `torque_Nm`
-    (`torque_N`), and the optional channels alike; a masked sample is NaN. The file appears whole or not at all.
+    (`torque_N`), and the optional channels alike; a masked sample is NaN, unless the torque was at its limit there,
+    which whoever reads it must see. The file appears whole or not at all.
 
     **Raises:** `ValueError` for another extension.
     """
@@ -46,6 +47,7 @@ def _named_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Column name -> (N,) values, as `save_recording` describes."""
     suffix_of = {unit: suffix for suffix, unit in SUFFIXES.items()}
     columns = {"time_s": recording.time}
+    clipped = False if recording.clipped is None else recording.clipped
     for channel in CHANNELS:
         values = getattr(recording, channel)
         if values is None:
@@ -53,7 +55,7 @@ def _named_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
         for i, column in enumerate(values.T):
             number = str(i + 1) if values.shape[1] > 1 else ""
             unit = si_unit(channel, recording.joints[min(i, recording.n_joints - 1)])
-            columns[f"{channel}{number}_{suffix_of[unit]}"] = np.where(recording.valid, column, np.nan)
+            columns[f"{channel}{number}_{suffix_of[unit]}"] = np.where(recording.valid | clipped, column, np.nan)
     return columns
 
 

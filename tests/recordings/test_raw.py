@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.recordings import recording_from_arrays
+from jaximp.recordings import load_recording, recording_from_arrays, save_recording
 from jaximp.types import Recording
 
 Numbers = NDArray[np.float64]
@@ -72,6 +74,19 @@ def test_a_torque_that_was_cut_off_is_masked(behind: float) -> None:
     assert (recording.clipped & ~beyond).sum() < 0.02 * beyond.sum()
     assert not (recording.valid & recording.clipped).any()
     assert "of the samples lie at a limit (4.5 and -0.5)" in kinds(recording)["torque: saturation"]
+
+
+@pytest.mark.parametrize(("jitter", "moved"), [(0.0, 0.0), (0.2, 0.05)], ids=["even stamps", "uneven stamps"])
+def test_a_torque_that_was_cut_off_is_so_when_it_is_saved_and_read_again(
+    jitter: float, moved: float, tmp_path: Path
+) -> None:
+    position, torque = joint()
+    time = TIME + jitter / RATE * np.random.default_rng(2).uniform(-1, 1, len(TIME))
+    recording = recording_from_arrays(time, position, np.clip(torque, -0.5, 4.5))
+    save_recording(recording, tmp_path / "cut.csv")
+    again = load_recording(tmp_path / "cut.csv", time="time_s", position="position_rad", torque="torque_Nm")
+    assert recording.clipped is not None and again.clipped is not None
+    assert (recording.clipped != again.clipped).mean() <= moved * recording.clipped.mean()
 
 
 def test_held_samples_are_joined_by_a_smooth_curve() -> None:
