@@ -47,8 +47,6 @@ def noise_in_band(W: AnyArray, torque: AnyArray, noisy: AnyArray, valid: AnyArra
     **Arguments:** rows of one output as they were filtered: `W` (N, p), `torque` (N,), `valid` (N,), and `noisy`
     (N, p), what the noise that is assumed makes of the columns.
     """
-    from scipy.signal import csd, welch
-
     counts = np.asarray(valid)
     if counts.sum() < FEWEST_SEGMENTS * SEGMENT or counts.mean() < 0.5 or not np.asarray(noisy).any():
         return 1.0
@@ -56,12 +54,21 @@ def noise_in_band(W: AnyArray, torque: AnyArray, noisy: AnyArray, valid: AnyArra
         np.where(counts, x - x[counts].mean(), 0)
         for x in (np.asarray(W) @ theta, np.asarray(torque), np.asarray(noisy) @ theta)
     )
-    asked, given, alone = (welch(x, nperseg=SEGMENT)[1][1:-1] for x in (needed, there, of_noise))
-    shared = np.abs(csd(needed, there, nperseg=SEGMENT)[1][1:-1]) ** 2 / (asked * given)
+    lines_of = _segments_by_frequency(np.stack([needed, there, of_noise]))
+    asked, given, alone = (np.abs(lines_of) ** 2).mean(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shared = np.abs((lines_of[0].conj() * lines_of[1]).mean(axis=0)) ** 2 / (asked * given)
     lines = (asked > MORE * given) & (shared < UNRELATED) & (alone > LEAST_SEEN * alone.max())
     if lines.sum() < FEWEST_LINES:
         return 1.0
     return max(1.0, float(np.median((asked - given)[lines] / alone[lines])))
+
+
+def _segments_by_frequency(x: Numbers) -> NDArray[np.complex128]:
+    """(k, segments, lines) of signals (k, N), of segments that overlap by half (Welch 1967), without zero frequency."""
+    segments = np.lib.stride_tricks.sliding_window_view(x, SEGMENT, axis=1)[:, :: SEGMENT // 2]
+    taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(SEGMENT) / SEGMENT)
+    return np.fft.rfft((segments - segments.mean(axis=2, keepdims=True)) * taper)[..., 1:-1]
 
 
 class Sums(NamedTuple):
