@@ -85,7 +85,8 @@ def test_a_torque_that_was_cut_off_is_so_when_it_is_saved_and_read_again(
     recording = recording_from_arrays(time, position, np.clip(torque, -0.5, 4.5))
     save_recording(recording, tmp_path / "cut.csv")
     again = load_recording(tmp_path / "cut.csv", time="time_s", position="position_rad", torque="torque_Nm")
-    assert recording.clipped is not None and again.clipped is not None
+    assert recording.clipped is not None
+    assert again.clipped is not None
     assert (recording.clipped != again.clipped).mean() <= moved * recording.clipped.mean()
 
 
