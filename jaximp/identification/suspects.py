@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -291,9 +290,11 @@ def _torque(model: Model, motion: Motion, theta: Numbers) -> Numbers:
     return np.concatenate(pieces)[:n]
 
 
-@partial(compiled, static_argnums=0)
-def _torque_of_piece(model: Model, q: Array, dq: Array, ddq: Array, theta: Array) -> Array:
+def _of_piece(model: Model, q: AnyArray, dq: AnyArray, ddq: AnyArray, theta: AnyArray) -> Array:
     return model.observation_matrix(q, dq, ddq)[model.memory :] @ theta
+
+
+_torque_of_piece = compiled(_of_piece, static_argnums=0)
 
 
 def of_arm(
