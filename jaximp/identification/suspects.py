@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -286,15 +287,13 @@ def _torque(model: Model, motion: Motion, theta: Numbers) -> Numbers:
     n, past = len(motion.q), model.memory
     starts = np.arange(0, n, PIECE)
     index = np.clip(starts[:, None] + np.arange(-past, PIECE), None, n - 1) % n
-    pieces = [_torque_of_piece(model, *(x[k] for x in (motion.q, motion.dq, motion.ddq)), theta) for k in index]
+    pieces = [_torque_of_piece(model, theta, *(x[k] for x in (motion.q, motion.dq, motion.ddq))) for k in index]
     return np.concatenate(pieces)[:n]
 
 
-def _of_piece(model: Model, q: AnyArray, dq: AnyArray, ddq: AnyArray, theta: AnyArray) -> Array:
-    return model.observation_matrix(q, dq, ddq)[model.memory :] @ theta
-
-
-_torque_of_piece = compiled(_of_piece, static_argnums=0)
+@partial(compiled, static_argnums=0)
+def _torque_of_piece(model: Model, theta: AnyArray, *motion: AnyArray) -> Array:
+    return model.observation_matrix(*motion)[model.memory :] @ theta
 
 
 def of_arm(
