@@ -59,7 +59,7 @@ def judge(
     curves: bool = True,
     misfits: tuple[Misfit, ...] = (),
 ) -> Estimates:
-    """Judge the windows of a fit. `gain`: the fit that `with_gain` makes."""
+    """Measure all that the rules look at; `Estimates.verdicts` applies them. `gain`: the fit that `with_gain` makes."""
     pipeline, model = prepared.pipeline, prepared.model
     solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
     fit, starts = _corrected(prepared, rows, solved.fit, place), place.starts[: len(solved.fit.last)]

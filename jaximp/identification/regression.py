@@ -1,4 +1,4 @@
-"""From a recording to rows for least squares: filters, derivatives, the model's columns, decimation.
+"""From a recording to rows: low-pass of torque and columns, derivatives, decimation. Nothing is solved here.
 
 Tout et al. 2023, III-B. Recordings come in stacks, padded to one length, and pass the filters once: together with a
 copy to which noise was added, which tells what noise of the position leaves in every column. One recording is a stack

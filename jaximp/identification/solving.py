@@ -1,7 +1,8 @@
 """Where windows lie in the rows of a recording, and all windows of a stack of recordings in one compiled call.
 
 One recording is a stack of one: what it gets does not depend on the others, to the last bit, nor on how far its rows
-are padded or on the room for longer windows, to rounding.
+are padded or on the room for longer windows, to rounding. The arithmetic is `least_squares.engine.solve_chunk`, and
+`estimates_of` in `least_squares.fits`.
 """
 
 from __future__ import annotations

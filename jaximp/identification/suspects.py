@@ -152,7 +152,8 @@ SUSPECTS: Mapping[str, Suspect] = {
         lambda m: [(m.t - m.t.mean()) * m.q, (m.t - m.t.mean()) * m.dq],
     ),
 }
-"""Who is asked of one joint, by name."""
+"""Tested on one joint, by name. A new one is a row here; of arms also in `OF_JOINTS`, and in `OF_MUSCLES` if a machine
+cannot have it. `misfit` knows delay, lag and clock by name."""
 
 
 # --- arms: every joint by itself, and what moves both --------------------------------------------------------------

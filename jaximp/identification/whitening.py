@@ -129,6 +129,7 @@ def whiten(pipeline: Pipeline, rows: Rows) -> White:
         found = [whiten_rows(z[:, j], valid[:, j], noise[j]) for j in range(outputs)]
         return found[0][:, None] if outputs == 1 else np.stack(found, axis=1)
 
+    # [W, torque, noisy] are whitened twice: by what the filters do to white noise, then by what is left of the noise.
     p, noisy = W.shape[-1], [] if rows.noisy is None else [rows.noisy.reshape(W.shape)]
     z = white(np.concatenate([W, y[..., None], *noisy], axis=-1), [filtered] * outputs)
     noise = tuple(fit_window_noise(z[:, j, :p], z[:, j, p], valid[:, j], window, every) for j in range(outputs))

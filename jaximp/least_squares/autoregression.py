@@ -150,7 +150,9 @@ def fit_window_noise(
     window: int,
     every: int = 1,
 ) -> Autoregression:
-    """The autoregression of the noise in y, from all windows of `window` rows side by side.
+    """The autoregression of the noise in y, from all windows of `window` rows side by side, for windows of a recording.
+
+    Posteriors, whose noise may have other parts, use `noise.fit_noise`.
 
     **Arguments:** rows at equal steps of time; `valid` False for those that do not count; `every`, see the top of this
     module.

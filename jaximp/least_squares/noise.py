@@ -179,6 +179,8 @@ def fit_noise(
 ) -> Noise:
     """What is known of the noise, with the autoregressions that the residuals of the whole record demand.
 
+    For posteriors; windows of a recording use `autoregression.fit_window_noise`.
+
     Arguments as for `whiten`; `stretch` rows have parameters of their own, so that what changes from one stretch to the
     next does not pass for noise: without it all rows share theirs. The residuals are those of the optimum; with the
     autoregressions it moves a little, so both are found in turns (Cochrane and Orcutt 1949). The optimum has followed

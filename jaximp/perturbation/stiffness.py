@@ -1,7 +1,8 @@
 """Damping and stiffness of two joints from how they answer to perturbations, the stiffness symmetric and definite.
 
 The model of Börner et al. 2020, eqs. (36) to (38): `torque = D velocity + K displacement`, of what a perturbation adds
-to the motion and to the torque of an outside force, less what the inertia takes. K = L L'.
+to the motion and to the torque of an outside force, less what the inertia takes. K = L L' (Cholesky), which
+`numerics.definite` keeps definite while it is fitted.
 
 Least squares problems with these residuals need no samples once the triangle R of a thin QR decomposition of
 `[velocity, displacement, torque]` is known: the sum of squares is that of `R [D'; K'; -I]`. So the triangles of trials

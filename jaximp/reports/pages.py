@@ -68,7 +68,7 @@ class Table:
 
     kind: ClassVar = "table"
     columns: Sequence[Column]
-    """None for a table without heads, of names and texts."""
+    """Empty for a table without heads, of names and texts."""
     rows: Sequence[Sequence[str]]
     void: Sequence[int] = ()
     """Rows that are not to be believed."""

@@ -82,21 +82,25 @@ def matrix_criteria(
     if not set(elements) <= set(names):
         return None
     index = np.array([list(names).index(element) for element in elements])
-    values, spread = np.asarray(theta)[:, index], _spread(stderr, covariance, index)
+    values, covariances = np.asarray(theta)[:, index], _spread(stderr, covariance, index)
     symmetric = values.reshape(-1, 2, 2)
     symmetric = (symmetric + symmetric.swapaxes(1, 2)) / 2
     known = np.isfinite(symmetric).all(axis=(1, 2))
     eigenvalues, v = np.linalg.eigh(np.where(known[:, None, None], symmetric, 0.0))
+    # d eigenvalue_k / d K_ij = v_ik v_jk
     slopes = np.einsum("mik,mjk->mkij", v, v).reshape(-1, 2, 4)
-    variance = np.einsum("mki,mij,mkj->mk", slopes, spread, slopes)
+    variance = np.einsum("mki,mij,mkj->mk", slopes, covariances, slopes)
     with np.errstate(invalid="ignore", divide="ignore"):
         # The norm of [[0, d], [-d, 0]] with d half the difference is |difference| / sqrt(2).
         size = np.sqrt(2) * np.linalg.norm(symmetric, axis=(1, 2))
         asymmetry = np.abs(values[:, 1] - values[:, 2]) / size
-        asymmetry_stderr = np.sqrt(spread[:, 1, 1] + spread[:, 2, 2] - 2 * spread[:, 1, 2]) / size
-    gone = np.where(known, 0.0, np.nan)
+        asymmetry_stderr = np.sqrt(covariances[:, 1, 1] + covariances[:, 2, 2] - 2 * covariances[:, 1, 2]) / size
+    unknown = np.where(known, 0.0, np.nan)
     return MatrixCriteria(
-        eigenvalues + gone[:, None], np.sqrt(variance) + gone[:, None], asymmetry + gone, asymmetry_stderr + gone
+        eigenvalues + unknown[:, None],
+        np.sqrt(variance) + unknown[:, None],
+        asymmetry + unknown,
+        asymmetry_stderr + unknown,
     )
 
 

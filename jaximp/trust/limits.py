@@ -37,7 +37,7 @@ class TrustLimits:
     """A window's matrix is not positive definite, or not symmetric, if that is so by so many standard errors; and it is
     surely positive definite (`confidence`) by so many."""
     max_condition: float | None = None
-    """Largest condition number (eq. 19 there); it depends on the units, and the paper knows no limit."""
+    """Largest condition number (Lakatos et al. 2011, eq. 19); it depends on the units, and the paper knows no limit."""
     joint_name: str | list[str] | None = None
     """Which human joint it is (finger, wrist, elbow, shoulder, ankle, knee, hip; of several joints a list), or `other`
     for what is none: an impedance that it cannot have is not trusted. By default what any human joint can have."""

@@ -48,7 +48,7 @@ JOINTS: Mapping[str, Ranges] = {
     "knee": Ranges((0.1, 0.7), (0.2, 10), (3, 500), "Zhang et al. 1998; Koopman et al. 2016"),
     "hip": Ranges((0.5, 6), (0.5, 40), (5, 1500), "Koopman et al. 2016"),
 }
-"""By name."""
+"""By name. A new one also widens `WIDEST`; `TrustLimits.joint_name` and docs/your-recording.md list the names."""
 WIDEST = Ranges(
     inertia=(min(one.inertia[0] for one in JOINTS.values()), max(one.inertia[1] for one in JOINTS.values())),
     damping=(min(one.damping[0] for one in JOINTS.values()), max(one.damping[1] for one in JOINTS.values())),

@@ -196,7 +196,7 @@ def judge_together(
 
     **Arguments:** `held_out` (M,) how each window predicts the next; windows `apart` of each other share no rows.
     """
-    excited = judge_all(EXCITATION[:MOVES], windows, limits).trusted
+    excited = judge_all(MOTION, windows, limits).trusted
     known = held_out[excited & np.isfinite(held_out)]
     worse = len(known) >= FEWEST_TOGETHER and float(np.median(known)) < 0
     below = -np.inf
@@ -293,7 +293,7 @@ def _asymmetry(w: Windows, limits: TrustLimits) -> str:
     return f"the stiffness is not symmetric: its antisymmetric part is {w.stiffness.asymmetry[0]:.0%}"
 
 
-EXCITATION: tuple[Rule[Windows], ...] = (
+MOTION: tuple[Rule[Windows], ...] = (
     Rule(
         "a torque inside its limits",
         NO_DATA,
@@ -323,6 +323,10 @@ EXCITATION: tuple[Rule[Windows], ...] = (
         ),
         lambda w, limits: "move more, or filter more (filter.position_cutoff)",
     ),
+)
+"""There are samples, and the joint moves."""
+EXCITATION: tuple[Rule[Windows], ...] = (
+    *MOTION,
     Rule(
         "enough degrees of freedom",
         WEAK,
@@ -343,8 +347,6 @@ EXCITATION: tuple[Rule[Windows], ...] = (
     ),
 )
 """What the motion must be for an estimate to say something."""
-MOVES = 4
-"""The first of them look at the motion alone."""
 
 RULES: tuple[Rule[Windows], ...] = (
     *EXCITATION,
@@ -426,4 +428,5 @@ RULES: tuple[Rule[Windows], ...] = (
         lambda w, limits: w.remedy,
     ),
 )
-"""From what leaves nothing to judge to what makes an estimate doubtful; the last spares some parameters."""
+"""From what leaves nothing to judge to what makes an estimate doubtful: the first that is broken gives the verdict. The
+last spares some parameters. What a rule looks at is a field of `Windows`, from `measure_windows` or `judging.judge`."""
