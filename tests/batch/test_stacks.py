@@ -74,7 +74,9 @@ CASES = {
 }
 
 
-LONGEST = ("lengths and rates", "robot", "white noise", "steps that miss the next window")
+LONGEST = (
+    "lengths and rates", "robot", "white noise", "steps that miss the next window", "noise with a long memory", "gaps",
+)  # fmt: skip
 """To compile: they are left to `make test-all`."""
 
 

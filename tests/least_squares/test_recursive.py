@@ -92,6 +92,7 @@ def test_forgetting_follows_a_step_of_the_stiffness() -> None:
     np.testing.assert_allclose(theta[599], truth[599], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop_and_the_gradient_is_finite_difference() -> None:
     W, y = (np.stack(x) for x in zip(*(regression(30, seed=seed) for seed in range(3)), strict=True))
     batch = jax.vmap(lambda W, y: recursive_least_squares(W, y, 0.9).theta)(W, y)

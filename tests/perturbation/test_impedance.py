@@ -152,6 +152,7 @@ def test_report_is_self_contained_and_escaped(results: Path) -> None:
     assert "8 to 23 % too large" in page
 
 
+@pytest.mark.slow
 def test_what_reading_says_is_said_once(arm: Path) -> None:
     job = read_job(arm / "job.toml")
     assert job.trials is not None
@@ -314,6 +315,7 @@ def test_a_handle_that_is_a_little_wrong_is_a_warning(enough: Path) -> None:
     assert any("a damping of 20.0" in warning for warning in found.warnings)
 
 
+@pytest.mark.slow
 def test_an_offset_of_the_force_sensor_is_no_disagreement(enough: Path) -> None:
     perturbed, _, _ = movements_of(enough)
     moved = eqx.tree_at(lambda m: m.force, perturbed, perturbed.force + jnp.array([3.0, -2.0]))
@@ -327,6 +329,7 @@ def test_methods_ask_for_the_handle(enough: Path, method: str) -> None:
         identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), method)
 
 
+@pytest.mark.slow
 def test_a_moving_hand_does_not_pass_for_one_at_rest(enough: Path) -> None:
     perturbed, unperturbed, _ = movements_of(enough)
     found = identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), "erden_billard")

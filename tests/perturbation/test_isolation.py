@@ -137,6 +137,7 @@ def test_integration_starts_at_the_onset(experiment: Experiment) -> None:
     assert shares(experiment, later)[0] > 1.2 * error
 
 
+@pytest.mark.slow
 def test_noise_free_jerk_isolation_is_nearly_exact() -> None:
     """Without noise only the movement itself leaks through the filter."""
     quiet = next(run_case(ARM, Case(amplitude=0.0), jax.random.split(jax.random.key(0), 1), static=False))

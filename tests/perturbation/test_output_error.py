@@ -191,7 +191,8 @@ def test_one_group_has_no_leading_axis(trials: Simulated, fit: OutputErrorFit) -
     assert (alone.stderr[4:7] < fit.stderr[:, 4:7]).all()
 
 
-@pytest.mark.parametrize("late", [-3, *(pytest.param(late, marks=pytest.mark.slow) for late in (2, 32))])
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [-3, 2, 32])
 def test_motion_that_lags_its_command_is_found(trials: Simulated, late: int) -> None:
     early = eqx.tree_at(lambda m: m.command, trials.perturbed, np.roll(trials.perturbed.command, -late, axis=1))
     fit = fit_of(eqx.tree_at(lambda t: t.perturbed, trials, early))
@@ -212,6 +213,7 @@ def test_a_slower_recording_is_integrated_in_the_same_steps(trials: Simulated) -
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=2e-3 * size, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_command_in_another_frame_is_noticed(trials: Simulated) -> None:
     """Turned by 0.1 rad: no impedance explains the motion."""
     turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])

@@ -76,6 +76,7 @@ def test_the_unit_of_a_column_changes_nothing() -> None:
     np.testing.assert_allclose([*other.move, other.p], [*one.move, one.p], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_good_data_raise_as_many_alarms_as_the_level_says() -> None:
     random, records = np.random.default_rng(3), 600
     p, alarms = [], 0

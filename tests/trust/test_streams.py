@@ -77,6 +77,7 @@ def test_after_a_change_it_is_doubtful_until_it_is_forgotten() -> None:
     assert error[step + 900 :].max() < 5
 
 
+@pytest.mark.slow
 def test_coloured_noise_is_doubtful() -> None:
     W, y = record()
     mean_of_eight = np.ones(8) / 8
@@ -89,6 +90,7 @@ def test_coloured_noise_is_doubtful() -> None:
     assert judged(W, y)[1].trusted[1000:].all()
 
 
+@pytest.mark.slow
 def test_columns_that_position_noise_alone_would_build_are_weak() -> None:
     W, y = record()
     size = np.sqrt((W**2).mean(axis=0)) * np.array([1, 1, 1, 0])

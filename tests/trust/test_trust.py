@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import product
 
 import jax.numpy as jnp
 import numpy as np
@@ -105,14 +106,19 @@ def test_a_moving_arm_is_believed(torque_noise: float, seed: int, decimate: int 
     assert estimates.verdicts.trusted[motion].mean() >= 0.95
 
 
-@noises
-@decimations
-def test_what_is_believed_in_motion_is_right(torque_noise: float, decimate: int | None) -> None:
+@pytest.mark.parametrize(
+    ("torque_noise", "decimate", "records"),
+    [
+        (0.2, None, 8),
+        *(pytest.param(*one, 24, marks=pytest.mark.slow) for one in [(0.2, 1), *product((0.02, 2.0), (None, 1))]),
+    ],
+)
+def test_what_is_believed_in_motion_is_right(torque_noise: float, decimate: int | None, records: int) -> None:
     # The position's filter of order 2 takes 1 % off the fastest line, and the torque does not pass it: that shows
     # where the noise is small. Order 8 takes nothing. Windows overlap: one record has eight that share no sample, and
     # one of them that is wrong is 5 % of its windows.
     wrong = []
-    for seed in range(24):
+    for seed in range(records):
         estimates = identified(MULTISINE, True, torque_noise, seed, decimate, order=8)
         trusted = estimates.verdicts.trusted & inside(estimates)[1]
         assert trusted.sum() > 200
