@@ -150,7 +150,7 @@ def driven(recorded: bool, drive: str | None) -> Fault:
     return fault
 
 
-OWN = ("the joint is free", "own torque makes", "instrumental variables by")
+OWN = ("the joint is free", "own torque makes", "instrumental variables by", "belongs with later motion")
 FAULTS: Mapping[str, tuple[Fault, str | None, tuple[str, ...]]] = {
     "nothing": (good, None, ()),
     "torque at a limit": (clipped, None, ("limit",)),

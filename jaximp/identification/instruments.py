@@ -29,11 +29,12 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.identification.misfit import Tests
 from jaximp.identification.pipeline import FREELY, IMPOSED, Pipeline
-from jaximp.identification.regression import Rows, measure, regress
-from jaximp.identification.whitening import whiten
+from jaximp.identification.regression import Rows, measure, measured_motion, regress
+from jaximp.identification.suspects import behind_filters
+from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Joints, Model
-from jaximp.trust.score_tests import ERRORS, SHARE
+from jaximp.trust.score_tests import ERRORS, SHARE, Misfit, significant
 from jaximp.types import Numbers, Recording
 
 LONGEST, FEWEST = 4.0, 8
@@ -47,6 +48,11 @@ ROUNDS = 2
 """How often the noise is estimated again with the parameters that its last estimate gave."""
 DEPENDENT = 1e-9
 """Smallest eigenvalue of columns of unit size."""
+LATER = (0.01, 0.02, 0.04)
+"""How much later the motion is looked at [s]."""
+RARELY, CLEARLY_MORE = 1e-3, 1.1
+"""Good records show as much with this probability; and by so much later motion explains more than any suspect: noise
+of the torque that moves the joint 1.1 to 6 times as much, a delay or a cuff at most 1.03 times."""
 FAR = 0.2
 """A bias to first order is no bound if it is a larger share of any parameter."""
 KINDS = ("inertia", "damping", "stiffness")
@@ -317,6 +323,24 @@ def may_be_off(pipeline: Pipeline, rows: Rows) -> Drive:
     if (np.abs(off[place]) > FAR * np.abs(theta[place])).any():
         off[place] = np.nan
     return Drive(off=off, note=FREE)
+
+
+def belongs_with_later_motion(
+    pipeline: Pipeline, recording: Recording, rows: Rows, white: White, misfits: Sequence[Misfit]
+) -> bool:
+    """Whether what is left of one joint's torque has more to do with where the joint goes than with any suspect.
+
+    A motion that is imposed knows nothing of the torque's noise before or after; what comes late or yields explains as
+    much by itself. **Arguments:** what the model may lack, `misfits`.
+    """
+    if not significant(misfits):
+        return False
+    q = measured_motion(pipeline.filter, recording).position[:, 0]
+    ahead = [round(seconds * recording.sample_rate) for seconds in LATER]
+    later = behind_filters(pipeline.filters, [np.append(q[k:], np.full(k, q[-1])) for k in ahead])
+    found = Tests.of(pipeline, white, rows.valid, [("later motion", {0: later})])()
+    most = max(one.evidence for one in misfits)
+    return bool(found) and found[0].p < RARELY and found[0].evidence > CLEARLY_MORE * max(most, 0)
 
 
 def moved_by(torque: Numbers, theta: Numbers, rate: float) -> Numbers:

@@ -14,7 +14,7 @@ from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
-from jaximp.identification.instruments import MOVED, REMEDY, Drive, in_windows_of
+from jaximp.identification.instruments import MOVED, REMEDY, Drive, belongs_with_later_motion, in_windows_of
 from jaximp.identification.misfit import (
     Known,
     by_bands,
@@ -315,7 +315,7 @@ def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers)
     if pipeline.drive is None:
         own = next((one for one in misfits if one.group == DRIVE), None)
         if drive is None or own is None:
-            return "the motion is taken as imposed; if the joint's own torque moves it too, say model.drive = 'free'"
+            return _assumed(prepared, misfits)
         if own not in significant(misfits):
             return f"the motion is taken as imposed, which its {drive.source} does not contradict (model.drive)"
         names, found = prepared.model.names, np.nanmedian(theta, axis=0) + own.move
@@ -328,6 +328,19 @@ def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers)
             "'estimated' and filter.mode = 'once'"
         )
     return ""
+
+
+def _assumed(prepared: Prepared, misfits: tuple[Misfit, ...]) -> str:
+    """That the motion is taken as imposed, and whether the torque contradicts that."""
+    pipeline = prepared.pipeline
+    if has_instruments(pipeline) and len(prepared.white) == 1:
+        given = (pipeline, prepared.recording, prepared.rows, prepared.white[0], misfits)
+        if belongs_with_later_motion(*given):
+            return (
+                "the motion is taken as imposed, but what is left of the torque belongs with later motion: noise of "
+                "the joint's own torque moves it (model.drive = 'free'), or is in the position"
+            )
+    return "the motion is taken as imposed; if the joint's own torque moves it too, say model.drive = 'free'"
 
 
 def _error_of_mean(stderr: Numbers) -> Numbers:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from factories import joints
 from factories.joints import TRUTH
+from factories.studies import run
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.instruments import explained_motion, moved_by
 from jaximp.jobs import parse_job
 from jaximp.jobs.run import identify_recording
-from jaximp.recordings import recording_from_arrays
+from jaximp.recordings import recording_from_arrays, save_recording
 from jaximp.types import Recording
 
 RATE, SAMPLES = 500.0, 12000
@@ -101,6 +104,16 @@ def test_declared_and_assumed_motion() -> None:
         parse_job(JOB.replace("human = true", 'human = true\ndrive = "torque"'))
 
 
+def test_later_motion_tells_of_own_torque_where_nothing_is_known() -> None:
+    words = "what is left of the torque belongs with later motion"
+    assert said(found(JOB, replace(driven(3), command=None)), words)
+    quiet = replace(driven(3, own=1e-3), command=None)
+    late = replace(quiet, torque=np.roll(quiet.torque, 3, axis=0))
+    estimates = found(JOB, late)
+    assert not estimates.trusted.any()
+    assert not said(estimates, words)
+
+
 def test_weak_instruments_are_refused() -> None:
     recording = driven(3)
     unrelated = np.random.default_rng(1).normal(size=recording.position.shape)
@@ -154,3 +167,20 @@ def test_joints_side_by_side_have_instruments_of_their_own() -> None:
 def test_where_there_are_no_instruments_it_is_said() -> None:
     filtered = FREE.replace("length = 3", 'length = 3\nnoise = "filtered"')
     assert said(found(filtered, driven(3)), "model.drive = 'free' changes nothing here")
+
+
+@pytest.mark.slow
+def test_a_batch_finds_the_same(tmp_path: Path) -> None:
+    """From files, whose command is a column like any other."""
+    mapping = '[recording]\nfile = "none.parquet"\ntime = "time_s"\nposition = "position_rad"\ntorque = "torque_Nm"'
+    job = FREE.replace("recording = {}", f'{mapping}\ncommand = "command_Nm"')
+    for seed in range(2):
+        save_recording(driven(seed), tmp_path / f"{seed}.parquet")
+    (tmp_path / "study.csv").write_text("file\n0.parquet\n1.parquet\n")
+    (tmp_path / "job.toml").write_text(job)
+    assert run(tmp_path, tmp_path / "out").failed == []
+    windows = pd.read_parquet(tmp_path / "out" / "estimates")
+    for seed, (_, table) in enumerate(windows.groupby("recording", observed=True)):
+        expected = found(FREE, driven(seed))
+        assert table["verdict"].tolist() == expected.verdicts.verdict.tolist()
+        np.testing.assert_allclose(table["stiffness"], expected.value[:, 2], rtol=1e-12)
