@@ -106,7 +106,7 @@ def test_declared_and_assumed_motion() -> None:
 
 def test_later_motion_tells_of_own_torque_where_nothing_is_known() -> None:
     words = "what is left of the torque belongs with later motion"
-    assert said(found(JOB, replace(driven(3), command=None)), words)
+    assert said(found(JOB, replace(driven(1), command=None)), words)
     quiet = replace(driven(3, own=1e-3), command=None)
     late = replace(quiet, torque=np.roll(quiet.torque, 3, axis=0))
     estimates = found(JOB, late)
