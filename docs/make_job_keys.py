@@ -61,7 +61,7 @@ RECORDING_JOB = (
         ModelSettings,
         "What is identified: `human = true`, `robot = true`, both, or an arm. Each may also be a table, with the keys "
         "below.",
-        only=("methods",),
+        only=("methods", "drive"),
     ),
     Table("[model.human]", HumanSettings, "A human joint: inertia, damping, stiffness and offset torque."),
     Table("[model.human.reflex]", ReflexSettings, "The stretch reflex of a human joint."),

@@ -48,8 +48,12 @@ class Signals:
     torque: Numbers
     stiffness: Numbers
     """(N,) [N m/rad]"""
+    command: Numbers | None = None
+    """(N,) torque that drives the joint and its rig [N m], where it is recorded."""
+    drive: str | None = None
+    """What the job says of it."""
 
-    def spoilt(self, **signals: Numbers) -> Signals:
+    def spoilt(self, **signals: Any) -> Signals:
         return replace(self, **signals)
 
 
@@ -123,6 +127,30 @@ def drifting(random: np.random.Generator, of: Signals) -> Signals:
     return of.spoilt(torque=of.torque + more, stiffness=stiffness)
 
 
+def followed(random: np.random.Generator, of: Signals) -> Signals:
+    """The motion is imposed, by a servo that lags behind what it was asked for."""
+    s = 2j * np.pi * np.fft.rfftfreq(len(of.time), 1 / of.motion.rate)
+    return of.spoilt(command=np.fft.irfft(of.motion.spectrum * (1 + 0.01 * s), len(of.time)))
+
+
+def driven(recorded: bool, drive: str | None) -> Fault:
+    """A torque drives the joint and a rig of up to the same impedance, and noise of the joint's torque moves both."""
+
+    def fault(random: np.random.Generator, of: Signals) -> Signals:
+        s, share = 2j * np.pi * np.fft.rfftfreq(len(of.time), 1 / of.motion.rate), random.uniform(0, 1)
+        rig = share * (0.3 * ankles.INERTIA * s**2 + 0.3 * ankles.DAMPING * s + ankles.STIFFNESS)
+        own = np.fft.rfft(of.torque - of.motion.through(ankles.impedance) - ankles.OFFSET)
+        moved = np.fft.irfft(-own / (ankles.impedance(s) + rig), len(of.time))
+        command = np.fft.irfft(of.motion.spectrum * (ankles.impedance(s) + rig), len(of.time))
+        held = np.fft.irfft((of.motion.spectrum + np.fft.rfft(moved)) * rig, len(of.time))
+        torque = command - held + ankles.OFFSET + 0.02 * random.normal(size=len(of.time))
+        position = of.position + moved
+        return of.spoilt(position=position, torque=torque, command=command if recorded else None, drive=drive)
+
+    return fault
+
+
+OWN = ("the joint is free", "own torque makes", "instrumental variables by", "belongs with later motion")
 FAULTS: Mapping[str, tuple[Fault, str | None, tuple[str, ...]]] = {
     "nothing": (good, None, ()),
     "torque at a limit": (clipped, None, ("limit",)),
@@ -149,6 +177,11 @@ FAULTS: Mapping[str, tuple[Fault, str | None, tuple[str, ...]]] = {
         ("gear",),
     ),
     "a clock twice too fast": (lambda random, of: of.spoilt(time=of.time / 2), "ankle", ("clock",)),
+    "joint driven by its own torque, nothing said": (driven(False, None), None, OWN),
+    'the same, `drive = "free"`': (driven(False, "free"), None, OWN),
+    "the same, with its command": (driven(True, None), None, OWN),
+    'the same, `drive = "free"`, with its command': (driven(True, "free"), None, OWN),
+    "nothing, with a reference that is followed": (followed, None, ()),
 }
 """What is done, the joint's name where it is given, and words that name the culprit."""
 
@@ -169,9 +202,9 @@ def tried(fault: Fault, name: str | None, words: tuple[str, ...], seed: tuple[in
     random = np.random.default_rng(seed)
     of = fault(random, record(random))
     try:
-        recording = recording_from_arrays(of.time, of.position, of.torque)
+        recording = recording_from_arrays(of.time, of.position, of.torque, command=of.command)
         pipeline = ankles.pipeline(recording.sample_rate)
-        pipeline = replace(pipeline, limits=replace(pipeline.limits, joint_name=name))
+        pipeline = replace(pipeline, limits=replace(pipeline.limits, joint_name=name), drive=of.drive)
         estimates = estimate(pipeline, recording)[0]
     except ValueError as error:
         return {"refused": 1.0, "wrong": 0.0, "named": any(word in str(error) for word in words), "off": [0.0] * 3}

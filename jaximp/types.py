@@ -95,14 +95,17 @@ class Recording:
         return len(self.time)
 
     def of_joint(self, j: int) -> Recording:
-        """Position and torque of one joint of several, counted from zero."""
+        """Position and torque of one joint of several, counted from zero, and what was asked of it."""
         this = slice(j, j + 1)
         seen, stated = (None if noise is None else noise[this] for noise in (self.position_noise, self.stated_noise))
+        reference, command = (None if x is None else x[:, this] for x in (self.reference, self.command))
         return replace(
             self,
             position=self.position[:, this],
             torque=self.torque[:, this],
             joints=self.joints[this],
+            reference=reference,
+            command=command,
             position_noise=seen,
             stated_noise=stated,
         )

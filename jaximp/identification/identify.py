@@ -125,7 +125,9 @@ def _misfits(prepared: Prepared, fit: SlidingFit) -> tuple[Misfit, ...]:
     usual = _usual(fit)
     if usual is None:
         return ()
-    return find_misfits(prepared.pipeline, prepared.recording, prepared.rows, prepared.white[0], usual)
+    recording = prepared.recording if prepared.explained is None else prepared.explained
+    own = None if prepared.drive is None else prepared.drive.own
+    return find_misfits(prepared.pipeline, recording, prepared.rows, prepared.white[0], usual, own)
 
 
 def _human_misfits(prepared: Prepared, pair: Pair, found: Separation, method: int) -> tuple[Misfit, ...]:
@@ -204,6 +206,8 @@ def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Pre
         reference=_of_joint(prepared.reference, this),
         white=prepared.white[this],
         solved=prepared.solved[this],
+        drives=prepared.drives[this],
+        explained=None if prepared.explained is None else prepared.explained.of_joint(j),
     )
 
 

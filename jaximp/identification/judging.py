@@ -14,6 +14,7 @@ from jaximp.identification.comparisons import by_frequency, changes
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.instruments import MOVED, REMEDY, Drive, belongs_with_later_motion, in_windows_of
 from jaximp.identification.misfit import (
     Known,
     by_bands,
@@ -26,10 +27,11 @@ from jaximp.identification.misfit import (
     sizes,
     unnoticed,
 )
-from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.prepared import Prepared
+from jaximp.identification.pipeline import FREELY, Pipeline
+from jaximp.identification.prepared import Prepared, has_instruments
 from jaximp.identification.regression import Rows
 from jaximp.identification.solving import Placement, Solved
+from jaximp.identification.suspects import DRIVE
 from jaximp.least_squares.sliding import score
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
@@ -68,7 +70,9 @@ def judge(
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
-    of_model = _OfModel.of(model, solved, misfits, place, judged_names(model, limits), pipeline.ordinary, weights)
+    judged = judged_names(model, limits)
+    of_model = _OfModel.of(model, solved, misfits, place, judged, pipeline.ordinary, weights)
+    of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
     sure, fit = fit, _with_open_moves(fit, of_model.moves)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
@@ -87,6 +91,7 @@ def judge(
         *of_model.notes,
         _delay(prepared, rows, misfits),
         *notes,
+        _drive_note(prepared, misfits, np.asarray(solved.fit.theta)),
     )
     changed = changes(pipeline, sure, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
     estimates = Estimates(
@@ -131,10 +136,17 @@ def _judged_by_the_human(
 
 
 def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement) -> SlidingFit:
-    """Where the torque's noise is estimated: without what noise of the position and change inside windows do."""
+    """Where the torque's noise is estimated: without what noise of the position, own motion of a free joint and change
+    inside windows do."""
     if len(prepared.white) != 1:
         return fit
     solved = rows if prepared.pipeline.ordinary else prepared.white[0]
+    drive = prepared.drive
+    if drive is not None and drive.W is not None:
+        both = np.concatenate([drive.W, np.asarray(drive.torque)[:, None]], axis=1)
+        both = both if prepared.pipeline.ordinary else prepared.white[0].apply(both, rows.valid)
+        given = (both[:, :-1], both[:, -1], np.asarray(solved.W), np.asarray(solved.torque))
+        fit = in_windows_of(fit, *given, np.asarray(rows.valid))
     return corrected(fit, solved.W, solved.noisy, rows.valid, _apart(place))
 
 
@@ -269,6 +281,66 @@ class _OfModel:
         moves, grown = open_moves(*tests, known) if misfits else (np.zeros(len(model.names)), "")
         notes = (harmless(*tests, known), grown, unnoticed(*tests, spared=weights))
         return cls(why, remedy, lacking, bands, moves, notes)
+
+    def with_drive(
+        self, drive: Drive | None, names: Sequence[str], judged: Sequence[str], fit: SlidingFit, place: Placement
+    ) -> _OfModel:
+        """With what is not known of a free joint: what may be off by more than error and a share that matters is
+        refused, and the errors of what may be off by less grow."""
+        if drive is None or not (drive.failed or drive.off is not None):
+            return self
+        theta, stderr = (np.asarray(x)[:: _apart(place)] for x in (fit.theta, fit.stderr))
+        found = drive.off_by(names, np.abs(np.nanmedian(theta, axis=0)), _error_of_mean(stderr))
+        lacking = {name: f"{MOVED}: {text}" for name, text in found.items()}
+        said = [text for name, text in found.items() if name in judged]
+        why = drive.failed or (f"{MOVED}: {', '.join(said)}" if said else "")
+        moves = self.moves
+        if drive.off is not None:
+            spared = np.array([name not in found for name in names])
+            moves = np.sqrt(moves**2 + np.where(spared, np.nan_to_num(drive.off), 0) ** 2)
+        return replace(
+            self,
+            why="; ".join(filter(None, [why, self.why])),
+            remedy="; ".join(filter(None, [REMEDY if why else "", self.remedy])),
+            lacking={**self.lacking, **(dict.fromkeys(names, drive.failed) if drive.failed else lacking)},
+            moves=moves,
+        )
+
+
+def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers) -> str:
+    """What is taken to move the joint, whose parameters are theta (M, p) by least squares."""
+    drive, pipeline = prepared.drive, prepared.pipeline
+    if drive is not None and drive.note:
+        return drive.note
+    if pipeline.drive is None:
+        own = next((one for one in misfits if one.group == DRIVE), None)
+        if drive is None or own is None:
+            return _assumed(prepared, misfits)
+        if own not in significant(misfits):
+            return f"the motion is taken as imposed, which its {drive.source} does not contradict (model.drive)"
+        names, found = prepared.model.names, np.nanmedian(theta, axis=0) + own.move
+        values = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, found, strict=True))
+        return f"the motion is taken as imposed; instrumental variables by the {drive.source} find {values}"
+    if pipeline.drive == FREELY and not has_instruments(pipeline):
+        return (
+            "model.drive = 'free' changes nothing here: instrumental variables and a bound of the bias are worked out "
+            "for joints that share no parameters, without a robot beside the human, and with window.noise = "
+            "'estimated' and filter.mode = 'once'"
+        )
+    return ""
+
+
+def _assumed(prepared: Prepared, misfits: tuple[Misfit, ...]) -> str:
+    """That the motion is taken as imposed, and whether the torque contradicts that."""
+    pipeline = prepared.pipeline
+    if has_instruments(pipeline) and len(prepared.white) == 1:
+        given = (pipeline, prepared.recording, prepared.rows, prepared.white[0], misfits)
+        if belongs_with_later_motion(*given):
+            return (
+                "the motion is taken as imposed, but what is left of the torque belongs with later motion: noise of "
+                "the joint's own torque moves it (model.drive = 'free'), or is in the position"
+            )
+    return "the motion is taken as imposed; if the joint's own torque moves it too, say model.drive = 'free'"
 
 
 def _error_of_mean(stderr: Numbers) -> Numbers:

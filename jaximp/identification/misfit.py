@@ -13,6 +13,7 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.regression import Rows
 from jaximp.identification.separation import Regression, Separation, Whiten
 from jaximp.identification.suspects import (
+    DRIVE,
     OF_MUSCLES,
     ROBOT,
     has_muscles,
@@ -51,11 +52,12 @@ would leave nothing to test with."""
 
 
 def find_misfits(
-    pipeline: Pipeline, recording: Recording, rows: Rows, white: White, theta: Numbers
+    pipeline: Pipeline, recording: Recording, rows: Rows, white: White, theta: Numbers, own: Numbers | None = None
 ) -> tuple[Misfit, ...]:
     """Test all suspects of one joint, or of an arm, whose parameters are some theta (p,).
 
-    **Arguments:** `rows` as they were filtered, and `white`.
+    **Arguments:** `rows` as they were filtered, and `white`; `own` columns (N, p) of the motion of one joint that its
+    reference does not explain, where it has one.
     """
     if recording.n_joints > 1:
         tests = Tests.of(pipeline, white, rows.valid, of_arm(pipeline, recording, rows.W, theta))
@@ -65,7 +67,8 @@ def find_misfits(
     counts = np.ravel(rows.valid)
     W, torque = (np.reshape(x, (len(counts), -1))[counts] for x in (white.W, white.torque))
     whole = np.linalg.lstsq(W, torque[:, 0])[0]
-    groups = ((name, {0: columns}) for name, columns in of_one_joint(pipeline, recording, whole))
+    suspects = [*of_one_joint(pipeline, recording, whole), *([] if own is None else [(DRIVE, own)])]
+    groups = ((name, {0: columns}) for name, columns in suspects)
     tests = Tests.of(pipeline, white, rows.valid, groups)
     return _of_joint(pipeline, _with_left(tests, tests()), theta, _half(pipeline, recording))
 

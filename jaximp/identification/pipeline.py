@@ -20,6 +20,8 @@ NOISE = ["estimated", "filtered"]
 """Choices of `WindowSettings.noise`."""
 ESTIMATES = ["generalised", "ordinary"]
 """Choices of `WindowSettings.estimates`."""
+IMPOSED, FREELY = DRIVES = ["position", "free"]
+"""Choices of `Pipeline.drive`."""
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
@@ -67,6 +69,9 @@ class Pipeline:
     """Which of the four methods tell the human from the robot."""
     reference: FourierSeries | float | None = None
     """The motion that was designed, or the period of the recorded reference [s]: for the threshold of fake changes."""
+    drive: str | None = None
+    """`position` where the motion is imposed; `free` where the joint's own torque moves it too; None takes the first,
+    and says so."""
 
     @property
     def filters(self) -> Filters:
@@ -134,6 +139,8 @@ class Pipeline:
         if self.window.estimates not in ESTIMATES:
             hint = nearest(self.window.estimates, ESTIMATES)
             raise ValueError(f"window.estimates is '{self.window.estimates}': {hint}")
+        if self.drive is not None and self.drive not in DRIVES:
+            raise ValueError(f"model.drive is '{self.drive}': {nearest(self.drive, DRIVES)}")
         design_filters(self.filter, self.sample_rate)
         if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
             _check_elbow(recording)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jaximp.identification.corrections import noise_in_band
 from jaximp.identification.delays import find_delay
+from jaximp.identification.instruments import Drive, find_drives
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import RobotTests
 from jaximp.identification.pipeline import NOISE, Pipeline, ReferenceMotion
@@ -57,6 +58,15 @@ class Prepared:
     """Rows whose noise is white, of each joint (of joints side by side), where the pipeline whitens."""
     solved: tuple[Solved, ...] = ()
     """One for each joint (of joints side by side), where the windows of the pipeline are solved already."""
+    drives: tuple[Drive, ...] = ()
+    """What is known of what moves each joint (of joints side by side), where something is."""
+    explained: Recording | None = None
+    """With the part of the motion that a reference explains, where the rows are those of this part."""
+
+    @property
+    def drive(self) -> Drive | None:
+        """Of one joint."""
+        return self.drives[0] if len(self.drives) == 1 else None
 
     @property
     def model(self) -> Model:
@@ -77,6 +87,12 @@ class Prepared:
 def can_be_stacked(pipeline: Pipeline) -> bool:
     """Whether recordings go through together: a pair needs two at a time, a reflex a second fit for its gain."""
     return pipeline.once and pipeline.robot is None and not pipeline.model.memory
+
+
+def has_instruments(pipeline: Pipeline) -> bool:
+    """Whether it can be asked what moves a joint: of joints that share nothing, in rows whose noise is white."""
+    alone = pipeline.model.n_joints == 1 or isinstance(pipeline.model, Joints)
+    return pipeline.whitens and pipeline.robot is None and alone
 
 
 def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
@@ -180,6 +196,10 @@ def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
 def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: Pair | None = None) -> Prepared:
     recording, pipeline = measured.recording, measured.pipeline
     reference = pipeline.reference_motion(recording)
+    drives: tuple[Drive, ...] = ()
+    explained = None
+    if has_instruments(pipeline) and pair is None:
+        rows, drives, explained = find_drives(pipeline, recording, rows, columns_by_joint(pipeline.model))
     white = tuple(whitened(pipeline, rows)) if pipeline.whitens and pair is None else ()
     times = _noise_in_band(rows, white)
     if times > CLEARLY_MORE:
@@ -188,7 +208,9 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
         white = (replace(one, noisy=more * np.asarray(one.noisy)),)
     if white and not pipeline.ordinary:
         noise = np.concatenate([one.column_noise for one in white])
-    return Prepared(recording, pipeline, rows, noise, pair, reference, measured.jumps, white)
+    return Prepared(
+        recording, pipeline, rows, noise, pair, reference, measured.jumps, white, drives=drives, explained=explained
+    )
 
 
 def _noise_in_band(rows: Rows, white: tuple[White, ...]) -> float:

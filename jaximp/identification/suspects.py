@@ -214,7 +214,20 @@ SCALE = Suspect(
     lambda m: [],
 )
 """Who is asked of both joints together."""
-WORDS: Mapping[str, Suspect | OfTorque] = {**OF_JOINTS, **SUSPECTS, "gravity": GRAVITY, "scale": SCALE}
+DRIVE = "drive"
+OWN_MOTION = Suspect(
+    "the motion that the joint's own torque makes",
+    "say model.drive = 'free': estimates are then instrumental variables by that channel",
+    lambda m: [],
+)
+"""Who is asked where a command or reference is known: the columns of the motion that it does not explain."""
+WORDS: Mapping[str, Suspect | OfTorque] = {
+    **OF_JOINTS,
+    **SUSPECTS,
+    "gravity": GRAVITY,
+    "scale": SCALE,
+    DRIVE: OWN_MOTION,
+}
 
 
 ROBOT = "robot"

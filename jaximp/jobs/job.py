@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from jaximp.design.files import read_trajectory
 from jaximp.identification.filter_settings import FilterSettings
-from jaximp.identification.pipeline import Pipeline, WindowSettings
+from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
@@ -29,7 +29,7 @@ from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping
 from jaximp.trust import plausibility
 from jaximp.trust.limits import TrustLimits
-from jaximp.types import Recording
+from jaximp.types import Recording, nearest
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,11 @@ class ModelSettings:
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
     beside it."""
+    drive: str | None = None
+    """What moves the joint: `position` where its motion is imposed, whatever torque that takes; `free` where its own
+    torque moves it too (it is driven by a torque, or the rig yields). The estimates of a free joint are instrumental
+    variables, by the column that `command` or, without it, `reference` maps. Without this key the motion is taken as
+    imposed; a note says so."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +196,7 @@ class WindowJob:
             robot=None if human is None else robot,
             methods=self.model.methods,
             reference=self.load_design() or self.reference_period,
+            drive=self.model.drive,
         )
 
     def _limits(self, joints: int) -> TrustLimits:
@@ -326,7 +332,7 @@ def posterior_settings(table: Any) -> PosteriorSettings:
 def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
-    check_keys(table, ["human", "robot", "arm", "methods"], "[model]")
+    check_keys(table, ["human", "robot", "arm", "methods", "drive"], "[model]")
     robot = optional(RobotSettings, table.get("robot", False), "model.robot")
     human = optional(HumanSettings, table.get("human", False), "model.human")
     arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])
@@ -339,7 +345,10 @@ def model_settings(table: Any) -> ModelSettings:
     methods = methods if isinstance(methods, list) else [methods]
     if not methods or any(type(method) is not int or method not in METHODS for method in methods):
         raise ValueError(f"model.methods is {methods}: list some of 1, 2, 3 and 4")
-    return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)))
+    drive = table.get("drive")
+    if drive is not None and drive not in DRIVES:
+        raise ValueError(f"model.drive is {drive!r}: {nearest(str(drive), DRIVES)}")
+    return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)), drive=drive)
 
 
 def _check_values(job: WindowJob) -> None:
