@@ -61,7 +61,7 @@ RECORDING_JOB = (
         ModelSettings,
         "What is identified: `human = true`, `robot = true`, both, or an arm. Each may also be a table, with the keys "
         "below.",
-        only=("methods", "drive"),
+        only=("methods", "drive", "robot_drift"),
     ),
     Table("[model.human]", HumanSettings, "A human joint: inertia, damping, stiffness and offset torque."),
     Table("[model.human.reflex]", ReflexSettings, "The stretch reflex of a human joint."),
@@ -117,6 +117,7 @@ KINDS = {
     bool: "true or false",
     str: "text",
     list[float]: "list of numbers",
+    dict[str, float]: "table of numbers",
     list[str]: "list of text",
     tuple[str, ...]: "list of names",
     tuple[int, ...]: "list of whole numbers",
@@ -177,10 +178,11 @@ def section(table: Table) -> Iterator[str]:
 def recording() -> Iterator[str]:
     """The keys of `[recording]`: the arguments that the docstring of `load_recording` explains."""
     arguments = (inspect.getdoc(load_recording) or "").split("**Arguments:**")[1].split("**Returns:**")[0].strip()
-    yield "### [recording] and [robot_recording]\n"
+    yield "### [recording], [robot_recording] and [robot_recording_after]\n"
     yield (
         "Where the measurements are: `file`, a path that begins at the job's folder, and the columns. "
-        "`[robot_recording]` has the same keys, and is the recording of the robot alone.\n"
+        "`[robot_recording]` has the same keys, and is the recording of the robot alone. `[robot_recording_after]` has "
+        "them too, and is a second one, made after the recording with the human: it tells how far the robot changed.\n"
     )
     yield arguments.replace("- `path`:", "- `file`:") + "\n"
 

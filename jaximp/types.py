@@ -115,6 +115,10 @@ MOST_CHOICES = 50
 """How many choices a hint names."""
 
 
+RobotAlone = Recording | tuple[Recording, Recording] | None
+"""The robot without the human: one recording, or one before and one after that with the human."""
+
+
 def listed(names: Sequence[str]) -> str:
     """a, b and c."""
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

@@ -42,7 +42,8 @@ PARTITIONS = ("subject", "session", "condition")
 """Columns of a manifest that partition the results, where nothing else is said."""
 MISSING = "missing"
 """An empty value in a folder's name."""
-KNOWN = ("file", "robot_file", *PARTITIONS)
+FILES = ("file", "robot_file", "robot_file_after")
+KNOWN = (*FILES, *PARTITIONS)
 """Columns of a manifest that mean something, in whatever case they are written."""
 MOST_NAMED = 20
 """Recordings that are refused and named one by one by the plan."""
@@ -60,6 +61,8 @@ class Item:
     file: Path
     robot_file: Path | None = None
     """The recording of the robot alone, in place of the job's."""
+    robot_file_after: Path | None = None
+    """The one after that with the human, likewise."""
     metadata: tuple[tuple[str, str], ...] = ()
     samples: int = 0
     """As the file says; zero where it cannot be read, which is found out when it is its turn."""
@@ -158,8 +161,8 @@ def find_items(files: Sequence[str], manifest: Path | None = None, allow_outside
     """The recordings that a command line or a manifest names, in a fixed order.
 
     **Arguments:** `files` paths, patterns such as `data/*.csv`, and folders, which are searched for known formats;
-    `manifest` a CSV or Parquet file with a column `file`, relative to its folder, perhaps `robot_file`, and metadata;
-    `allow_outside` lets its paths leave its folder.
+    `manifest` a CSV or Parquet file with a column `file`, relative to its folder, perhaps
+    `robot_file` and `robot_file_after`, and metadata; `allow_outside` lets its paths leave its folder.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
@@ -220,13 +223,12 @@ def _from_manifest(manifest: Path, allow_outside: bool) -> list[Item]:
     for where, row in rows.items():
         if not row.get("file"):
             raise ValueError(f"{where}: the column 'file' is empty; name a recording, or delete the row")
-        file, robot = (
-            None if not row.get(column) else _inside(folder, row[column], where, allow_outside)
-            for column in ("file", "robot_file")
+        file, robot, after = (
+            None if not row.get(column) else _inside(folder, row[column], where, allow_outside) for column in FILES
         )
         assert file is not None
-        metadata = tuple((key, value) for key, value in row.items() if key not in ("file", "robot_file"))
-        items.append(Item(Path(row["file"]).as_posix(), file, robot, metadata))
+        metadata = tuple((key, value) for key, value in row.items() if key not in FILES)
+        items.append(Item(Path(row["file"]).as_posix(), file, robot, after, metadata))
     return items
 
 
@@ -346,6 +348,10 @@ def make_plan(job: WindowJob, items: Sequence[Item], partitions: Sequence[str] |
     """
     if job.robot_recording is None and any(item.robot_file is not None for item in items):
         raise ValueError("the manifest has a robot_file, but the job no [robot_recording] to read it by: add the table")
+    if job.robot_recording_after is None and any(item.robot_file_after is not None for item in items):
+        raise ValueError(
+            "the manifest has a robot_file_after, but the job no [robot_recording_after] to read it by: add the table"
+        )
     metadata = tuple(dict.fromkeys(key for item in items for key, _ in item.metadata))
     chosen = tuple(partitions) if partitions is not None else tuple(name for name in PARTITIONS if name in metadata)
     _check_partitions(chosen, metadata, items)
@@ -392,7 +398,8 @@ def padded_sizes(samples: Sequence[int], most: int = MOST_SIZES) -> list[int]:
 
 def _sized(item: Item, columns: Sequence[str]) -> Item:
     """The item with its number of samples, or with why it is refused."""
-    refused = why_refused(item.file) or (why_refused(item.robot_file) if item.robot_file is not None else "")
+    files = [file for file in (item.file, item.robot_file, item.robot_file_after) if file is not None]
+    refused = next(filter(None, map(why_refused, files)), "")
     if refused:
         return replace(item, refused=refused)
     try:

@@ -31,7 +31,7 @@ from jaximp.identification.regression import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import WindowJob
 from jaximp.recordings.errors import UnavailableError
-from jaximp.types import Recording
+from jaximp.types import Recording, RobotAlone
 
 UNFINISHED = ".unfinished"
 """End of a temporary name."""
@@ -245,13 +245,16 @@ def _prepared(several: Sequence[Measured], padded: int, stacked: int) -> list[Pr
     return [next(solved) if isinstance(one, Prepared) else one for one in results]
 
 
-def _alone(task: Task, item: Item) -> Recording | None:
-    """The recording of the robot alone: the manifest's, or the job's."""
-    table = task.job.robot_recording
-    if table is None:
-        return None
-    file = item.robot_file or task.job.folder / str(table["file"])
-    return _robot_alone(json.dumps(dict(table), sort_keys=True), file, task.job.folder, file_checksum(file))
+def _alone(task: Task, item: Item) -> RobotAlone:
+    """The recording of the robot alone, or both: the manifest's, or the job's."""
+    job, several = task.job, []
+    for table, named in ((job.robot_recording, item.robot_file), (job.robot_recording_after, item.robot_file_after)):
+        if table is not None:
+            file = named or job.folder / str(table["file"])
+            several.append(_robot_alone(json.dumps(dict(table), sort_keys=True), file, job.folder, file_checksum(file)))
+    if len(several) == 2:
+        return several[0], several[1]
+    return several[0] if several else None
 
 
 @lru_cache(maxsize=4)
@@ -336,7 +339,7 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
     return found.reason
 
 
-def write_report_of(job: WindowJob, recording: Recording, alone: Recording | None, folder: Path) -> None:
+def write_report_of(job: WindowJob, recording: Recording, alone: RobotAlone, folder: Path) -> None:
     """What `identify` writes, for one recording."""
     from jaximp.identification.identify import at_other_lengths
     from jaximp.recordings.outputs import new_folder

@@ -44,7 +44,10 @@ class Task:
 
     def key(self, batch: Batch) -> str:
         """Checksum of everything that a batch's results depend on, its inputs' content apart."""
-        members = [(item.name, item.metadata, str(item.robot_file or ""), item.refused) for item in batch.items]
+        members = [
+            (item.name, item.metadata, str(item.robot_file or ""), str(item.robot_file_after or ""), item.refused)
+            for item in batch.items
+        ]
         study = [job_checksum(self.job), versions(), self.partitions, self.metadata, self.sizes, self.joints]
         about = [*study, batch.padded, members]
         return checksum(json.dumps(about, sort_keys=True).encode())
@@ -110,14 +113,14 @@ def file_checksum(path: Path | None) -> str:
 def job_checksum(job: WindowJob) -> str:
     """Of the job file, and of the design and the robot's recording that it names."""
     design = "" if job.design is None else file_checksum((job.folder / job.design).resolve())
-    robot = (job.robot_recording or {}).get("file")
-    alone = "" if robot is None else file_checksum((job.folder / str(robot)).resolve())
-    return checksum("\n".join([job.text, design, alone]).encode())
+    robots = [(table or {}).get("file") for table in (job.robot_recording, job.robot_recording_after)]
+    alone = ["" if robot is None else file_checksum((job.folder / str(robot)).resolve()) for robot in robots]
+    return checksum("\n".join([job.text, design, *alone]).encode())
 
 
 def input_checksum(item: Item) -> str:
-    alone = "" if item.robot_file is None else "+" + file_checksum(item.robot_file)
-    return file_checksum(item.file) + alone
+    alone = ["+" + file_checksum(file) for file in (item.robot_file, item.robot_file_after) if file is not None]
+    return "".join([file_checksum(item.file), *alone])
 
 
 def load(table: Mapping[str, Any], file: Path, folder: Path) -> Recording:

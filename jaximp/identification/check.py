@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.identification.delays import UNKNOWN, find_delay
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.identify import estimate
+from jaximp.identification.identify import estimate, robot_sameness
 from jaximp.identification.judging import jump_note
 from jaximp.identification.pipeline import NOISE, Pipeline
 from jaximp.identification.prepared import columns_by_joint, prepare
 from jaximp.identification.regression import jumped, once
+from jaximp.identification.robot_changes import NOT_ASKED
 from jaximp.models.base import combine
 from jaximp.trust.limits import TrustLimits
+from jaximp.trust.score_tests import FAMILYWISE
 from jaximp.trust.verdicts import NO_DATA, WEAK
 from jaximp.trust.window_rules import POSITIVE_INERTIA
-from jaximp.types import Progress, Recording
+from jaximp.types import Progress, Recording, RobotAlone
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
 FEWEST = 100
@@ -59,7 +61,7 @@ class Proposal:
 
 
 def check_recording(
-    pipeline: Pipeline, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    pipeline: Pipeline, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
 ) -> tuple[list[Finding], Proposal]:
     """Check a recording for the model of a pipeline, and propose cut-offs and a window."""
     if len(recording) < FEWEST:
@@ -86,7 +88,7 @@ def check_recording(
             f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
         )
     )
-    findings.append(_delay(pipeline, recording))
+    findings += [_delay(pipeline, recording), *_robot(pipeline, recording, alone)]
     progress(0.3)
     window, of_windows = _window(pipeline, recording, alone, progress)
     why = (
@@ -214,8 +216,24 @@ def _delay(pipeline: Pipeline, recording: Recording) -> Finding:
     return Finding("delay", LOOK, f"{text} ({best.seconds * recording.sample_rate:.1f} samples): {remedy}")
 
 
+def _robot(pipeline: Pipeline, recording: Recording, alone: RobotAlone) -> list[Finding]:
+    """Whether it is the same in all recordings of a pair."""
+    if pipeline.robot is None or alone is None:
+        return []
+    with suppress(ValueError):  # the windows say why nothing can be tried
+        window = replace(pipeline.window, length=min(pipeline.window.length, LONGEST_WINDOW), noise=NOISE[0])
+        prepared = prepare(replace(once(pipeline), window=window), recording, alone)
+        assert prepared.pair is not None
+        same, notes = robot_sameness(prepared, prepared.pair), prepared.pair.notes
+        changed = same is not None and same.differs
+        said = [same.in_words()] if same is not None else []
+        verdict = BAD if changed else LOOK if notes == (NOT_ASKED,) or prepared.pair.agree < FAMILYWISE else GOOD
+        return [Finding("robot", verdict, "; ".join([*said, *notes]))]
+    return []
+
+
 def _window(
-    pipeline: Pipeline, recording: Recording, alone: Recording | None, progress: Progress
+    pipeline: Pipeline, recording: Recording, alone: RobotAlone, progress: Progress
 ) -> tuple[float | None, list[Finding]]:
     """Of a few lengths in which nine windows of ten are excited, the one that predicts the next window best."""
     duration = len(recording) / recording.sample_rate
@@ -239,7 +257,7 @@ def _window(
     ]
 
 
-def _trial(pipeline: Pipeline, recording: Recording, alone: Recording | None, length: float) -> Estimates | None:
+def _trial(pipeline: Pipeline, recording: Recording, alone: RobotAlone, length: float) -> Estimates | None:
     """Estimates with windows of one length; None where it cannot be tried."""
     step = max(length / 10, len(recording) / recording.sample_rate / 200)
     trial = replace(pipeline.with_window(length, step), methods=pipeline.methods[:1])

@@ -102,6 +102,9 @@ class Estimates(Result):
     robot: WindowFit | None = None
     """The robot's parameters, where a method needed them."""
     robot_names: tuple[str, ...] = ()
+    robot_change: NDArray[np.float64] | None = None
+    """(r,) standard deviation of what the robot's parameters may differ by in the recording with the human, beyond the
+    errors of their estimates, as far as this is known."""
     notes: tuple[str, ...] = ()
     """What a reader must know of these numbers, in plain words."""
     misfits: tuple[Misfit, ...] = ()

@@ -21,6 +21,7 @@ from jaximp.identification.misfit import find_human_misfits, find_misfits
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, prepare, whitener, with_windows
 from jaximp.identification.regression import Rows
+from jaximp.identification.robot_changes import Doubts, Sameness
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
 from jaximp.identification.whitening import from_filtered, from_white
@@ -29,18 +30,19 @@ from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Joints, combine
 from jaximp.models.reflex import with_gain
 from jaximp.trust.score_tests import Misfit
-from jaximp.types import Progress, Recording, nearest
+from jaximp.types import Progress, Recording, RobotAlone, nearest
 
 
 def estimate(
     pipeline: Pipeline,
     recording: Recording,
-    alone: Recording | None = None,
+    alone: RobotAlone = None,
     progress: Progress = lambda share: None,
 ) -> list[Estimates]:
     """Identify a recording in all windows: one `Estimates` for each method (one where there is no pair).
 
-    **Arguments:** `alone`, the recording of the robot without the human, where the pipeline has a robot.
+    **Arguments:** `alone`, the recording of the robot without the human, where the pipeline has a robot; or two, one
+    before and one after that with the human.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
@@ -135,7 +137,7 @@ def _human_misfits(prepared: Prepared, pair: Pair, found: Separation, method: in
     usual = _usual(found.fit)
     if pair.tests is None or usual is None:
         return ()
-    left = partial(robot_columns, method, loaded=pair.loaded)
+    left = partial(robot_columns, method, alone=pair.alone, loaded=pair.loaded)
     return find_human_misfits(prepared.pipeline, prepared.recording, found, usual, left, pair.tests)
 
 
@@ -150,13 +152,14 @@ def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Prog
     """The human in the robot, by every method that is asked for."""
     rows, methods = prepared.rows, prepared.pipeline.methods
     noise = None if prepared.pipeline.whitens else prepared.noise
-    merge = combine(pair.robot, prepared.model).merge
+    merge, same = combine(pair.robot, prepared.model).merge, robot_sameness(prepared, pair)
+    follow = same is not None and same.differs
     results = []
     for count, method in enumerate(methods):
 
         def solve_pair(alone: Regression, loaded: Regression, method: int = method) -> Separation:
             given = (merge, place.window, place.step, noise, place.given_room, whitener(prepared.pipeline))
-            return separate(method, pair.robot_fit, alone, loaded, *given)
+            return separate(method, pair.robot_fit, alone, loaded, *given, pair.change, follow)
 
         found, gain = solve_pair(pair.alone, pair.loaded), None
         if prepared.model.memory:
@@ -165,15 +168,30 @@ def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Prog
         n = len(found.torque)
         human = Rows(pair.loaded.human[:n], found.torque, rows.valid[:n], rows.time[:n])
         solved = _predict(human, found.fit, place)
-        notes, own = (METHODS[method], found.warning, pair.tests.note if pair.tests else ""), prepared
+        doubts = Doubts.of_method(prepared.model.names, found, same)
+        told = (found.warning, pair.tests.note if pair.tests else "", *pair.notes, doubts.note)
+        notes, own = (METHODS[method], *told), prepared
         if found.white is not None and rows.noisy is not None and not prepared.pipeline.ordinary:
             noisy = found.white.apply(rows.noisy[:n, len(pair.robot.names) :], rows.valid[:n])
             own = replace(prepared, column_noise=np.sqrt((noisy**2).mean(axis=0)))
         misfits = _human_misfits(prepared, pair, found, method)
-        estimates = judge(own, human, solved, place, method, *notes, gain=gain, curves=curves, misfits=misfits)
-        results.append(replace(estimates, method=method, robot=pair.robot_fit, robot_names=pair.robot.names))
+        estimates = judge(
+            own, human, solved, place, method, *notes, gain=gain, curves=curves, misfits=misfits, doubts=doubts
+        )
+        may_change = np.sqrt(np.diagonal(pair.change))
+        of_robot = replace(estimates, robot=pair.robot_fit, robot_names=pair.robot.names, robot_change=may_change)
+        results.append(replace(of_robot, method=method))
         progress((count + 1) / len(methods))
     return results
+
+
+def robot_sameness(prepared: Prepared, pair: Pair) -> Sameness | None:
+    """What the robot's own parameters say of a change between the recordings; nothing without white rows."""
+    whiten, loaded = whitener(prepared.pipeline), pair.loaded
+    if whiten is None:
+        return None
+    white = whiten(loaded.human, loaded.torque - loaded.robot @ pair.robot_fit.theta, loaded.valid)
+    return Sameness.of(pair.robot, prepared.model, pair.robot_fit, pair.change, loaded, white)
 
 
 def _joint_by_joint(
@@ -284,7 +302,7 @@ def _reflexes_side_by_side(parts: list[Estimates]) -> Iterator[Reflex]:
 
 def at_other_lengths(
     prepared: Prepared,
-    alone: Recording | None = None,
+    alone: RobotAlone = None,
     factors: tuple[float, ...] = (0.5, 2.0),
     progress: Progress = lambda share: None,
 ) -> list[Estimates]:

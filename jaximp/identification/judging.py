@@ -30,6 +30,7 @@ from jaximp.identification.misfit import (
 from jaximp.identification.pipeline import FREELY, Pipeline
 from jaximp.identification.prepared import Prepared, has_instruments
 from jaximp.identification.regression import Rows
+from jaximp.identification.robot_changes import NO_DOUBTS, Doubts
 from jaximp.identification.solving import Placement, Solved
 from jaximp.identification.suspects import DRIVE
 from jaximp.least_squares.sliding import score
@@ -60,8 +61,10 @@ def judge(
     gain: SlidingFit | None = None,
     curves: bool = True,
     misfits: tuple[Misfit, ...] = (),
+    doubts: Doubts = NO_DOUBTS,
 ) -> Estimates:
-    """Measure all that the rules look at; `Estimates.verdicts` applies them. `gain`: the fit that `with_gain` makes."""
+    """Measure all that the rules look at; `Estimates.verdicts` applies them. `gain`: the fit that `with_gain` makes;
+    `doubts` beside what the model lacks."""
     pipeline, model = prepared.pipeline, prepared.model
     solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
     fit, starts = _corrected(prepared, rows, solved.fit, place), place.starts[: len(solved.fit.last)]
@@ -73,6 +76,7 @@ def judge(
     judged = judged_names(model, limits)
     of_model = _OfModel.of(model, solved, misfits, place, judged, pipeline.ordinary, weights)
     of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
+    of_model = of_model.with_doubts(doubts, judged)
     sure, fit = fit, _with_open_moves(fit, of_model.moves)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
@@ -305,6 +309,15 @@ class _OfModel:
             lacking={**self.lacking, **(dict.fromkeys(names, drive.failed) if drive.failed else lacking)},
             moves=moves,
         )
+
+    def with_doubts(self, doubts: Doubts, judged: Sequence[str]) -> _OfModel:
+        """And with what else speaks against parameters."""
+        found = dict.fromkeys(text for name, text in doubts.of.items() if name in judged)
+        why = "; ".join(filter(None, [self.why, *found]))
+        remedy = "; or ".join(dict.fromkeys(filter(None, [self.remedy, doubts.remedy if found else ""])))
+        lacking = {**doubts.of, **self.lacking}
+        moves = self.moves if doubts.moves is None else np.hypot(self.moves, doubts.moves)
+        return replace(self, why=why, remedy=remedy, lacking=lacking, moves=moves)
 
 
 def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers) -> str:

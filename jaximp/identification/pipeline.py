@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
@@ -67,6 +68,9 @@ class Pipeline:
     """The robot that holds the human whom `model` describes; None where there is no such pair."""
     methods: tuple[int, ...] = (1,)
     """Which of the four methods tell the human from the robot."""
+    robot_drift: float | Mapping[str, float] | None = None
+    """Standard deviation of what the robot's parameters may have changed by between recordings, as a share of each: a
+    number for those that the human shares, or some by name. None: nobody knows."""
     reference: FourierSeries | float | None = None
     """The motion that was designed, or the period of the recorded reference [s]: for the threshold of fake changes."""
     drive: str | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -17,13 +17,21 @@ from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import RobotTests
 from jaximp.identification.pipeline import NOISE, Pipeline, ReferenceMotion
 from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
+from jaximp.identification.robot_changes import (
+    NOT_ASKED,
+    between,
+    compared,
+    drift_covariance,
+    drift_in_words,
+    mean_of_both,
+)
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.recordings.delays import moved_forward
-from jaximp.types import Recording
+from jaximp.types import Recording, RobotAlone
 
 CLEARLY_MORE = 1.5
 """Times the variance of the noise that its samples show."""
@@ -35,10 +43,19 @@ class Pair:
 
     robot: Model
     robot_fit: WindowFit
+    """Of the robot alone; the mean of both, where there are two recordings of it."""
+    change: NDArray[np.float64]
+    """(r, r) covariance of what the robot's parameters may differ by in the recording with the human, beyond the errors
+    of that fit."""
     alone: Regression
+    """With the torque of the robot that has the parameters of the fit."""
     loaded: Regression
     tests: RobotTests | None
     """Of the robot's model, where the pipeline whitens."""
+    notes: tuple[str, ...] = ()
+    """How far the robot may have changed, in words."""
+    agree: float = 1.0
+    """Probability of a difference as large as that of two recordings of the robot alone, if it did not change."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +119,13 @@ def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
     return noise_in_windows(pipeline)
 
 
-def prepare(pipeline: Pipeline, recording: Recording, alone: Recording | None = None) -> Prepared:
-    """Filter a recording, and that of the robot alone where there is a pair."""
-    recording, alone = without_unknown_delay(pipeline, recording), alone and without_unknown_delay(pipeline, alone)
+def prepare(pipeline: Pipeline, recording: Recording, alone: RobotAlone = None) -> Prepared:
+    """Filter a recording, and that of the robot alone (or both of them) where there is a pair."""
+    recording = without_unknown_delay(pipeline, recording)
     if pipeline.robot is not None:
-        return _prepare_pair(pipeline, pipeline.robot, recording, alone)
+        given = () if alone is None else alone if isinstance(alone, tuple) else (alone,)
+        several = tuple(without_unknown_delay(pipeline, one) for one in given)
+        return _prepare_pair(pipeline, pipeline.robot, recording, several)
     pipeline.check(recording)
     measured = measure(pipeline, recording)
     if pipeline.once:
@@ -160,37 +179,65 @@ def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tupl
     return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, measured
 
 
-def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, alone: Recording | None) -> Prepared:
+def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, several: tuple[Recording, ...]) -> Prepared:
+    """**Arguments:** `several` recordings of the robot alone: one, or one before and one after the human's."""
     pipeline.check(recording)
-    alone = _checked_pair(recording, alone)
-    # The robot's own parameters come from its whole recording, which needs no windows.
-    whole_record = once(pipeline)
-    whole = regress_pair(whole_record, robot, alone)[0]
-    known = None if pipeline.whitens else noise_of(whole_record)
+    _check_pair(recording, several)
+    # The robot's own parameters come from its whole recordings, which need no windows.
+    whole = [regress_pair(once(pipeline), robot, one)[0] for one in several]
+    fits = [_fit_robot(pipeline, one) for one in whole]
     of_rows = whitener(pipeline)
-    white = None if of_rows is None else of_rows(whole.robot, whole.torque, whole.valid)
-    robot_fit = fit_robot(whole, None if known is None else jnp.asarray(known), white)
-    tests = None if of_rows is None else RobotTests.of(pipeline, alone, whole, of_rows)
+    tests = None if of_rows is None else RobotTests.of(pipeline, several[0], whole[0], of_rows)
     # Methods 1 and 2 need no windows of the robot alone.
     shared = pipeline.once or not {3, 4}.intersection(pipeline.methods)
-    in_windows = whole if shared else regress_pair(pipeline, robot, alone)[0]
+    in_windows = whole[0] if shared else regress_pair(pipeline, robot, several[0])[0]
     loaded, rows, measured = regress_pair(pipeline, robot, recording)
     noise = column_noise(measured) if rows.noisy is None else np.sqrt((rows.noisy**2).mean(axis=0))
-    pair = Pair(robot, robot_fit, in_windows, loaded, tests)
+    pair = _pair(pipeline, robot, fits, in_windows, loaded, tests)
     return _prepared(measured, rows, noise[len(robot.names) :], pair)
 
 
-def _checked_pair(recording: Recording, alone: Recording | None) -> Recording:
-    if alone is None:
+def _fit_robot(pipeline: Pipeline, alone: Regression) -> WindowFit:
+    of_rows = whitener(pipeline)
+    known = None if pipeline.whitens else noise_of(once(pipeline))
+    white = None if of_rows is None else of_rows(alone.robot, alone.torque, alone.valid)
+    return fit_robot(alone, None if known is None else jnp.asarray(known), white)
+
+
+def _pair(
+    pipeline: Pipeline,
+    robot: Model,
+    fits: Sequence[WindowFit],
+    alone: Regression,
+    loaded: Regression,
+    tests: RobotTests | None,
+) -> Pair:
+    """With what is known of changes of the robot. **Arguments:** `fits` of each of its recordings."""
+    before, fit, p, of_both = fits[0], fits[0], 1.0, ""
+    change = np.zeros((len(robot.names), len(robot.names)))
+    if len(fits) > 1:
+        fit = mean_of_both(*fits)
+        change = between(*fits)
+        p, of_both = compared(robot.names, *fits)
+        alone = replace(alone, torque=alone.torque + alone.robot @ (fit.theta - before.theta))
+    drift = drift_covariance(robot, pipeline.model, fit.theta, pipeline.robot_drift)
+    of_drift = drift_in_words(robot, drift, fit.theta)
+    unknown = pipeline.robot_drift is None and not of_both
+    notes = tuple(filter(None, [of_both, of_drift, NOT_ASKED if unknown else ""]))
+    return Pair(robot, fit, change + drift, alone, loaded, tests, notes, p)
+
+
+def _check_pair(recording: Recording, several: tuple[Recording, ...]) -> None:
+    if not several:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
-    if recording.n_joints != 1 or alone.n_joints != 1:
-        raise ValueError("methods 1 to 4 work on one joint at a time: map one position and one torque column")
-    if abs(alone.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
-        raise ValueError(
-            f"the robot alone was sampled at {alone.sample_rate:g} Hz and the robot with the human at "
-            f"{recording.sample_rate:g} Hz: resample one of them"
-        )
-    return alone
+    for alone in several:
+        if recording.n_joints != 1 or alone.n_joints != 1:
+            raise ValueError("methods 1 to 4 work on one joint at a time: map one position and one torque column")
+        if abs(alone.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
+            raise ValueError(
+                f"the robot alone was sampled at {alone.sample_rate:g} Hz and the robot with the human at "
+                f"{recording.sample_rate:g} Hz: resample one of them"
+            )
 
 
 def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: Pair | None = None) -> Prepared:

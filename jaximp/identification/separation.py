@@ -6,8 +6,8 @@ regressions: rows of the robot's and the human's model, and the motor's torque.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -19,10 +19,11 @@ from jaxtyping import Array, Bool, Float, Num
 from jaximp.identification.whitening import White, from_filtered, from_white, with_sizes_of_one
 from jaximp.least_squares.sliding import sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit, least_squares
+from jaximp.trust.score_tests import ERRORS, SHARE
 from jaximp.types import AnyArray
 
-SAME_MOTION = 0.05
-"""Method 3 needs one motion twice. The robot's own torque may differ by this share of the human's torque."""
+OTHER_MOTION = 0.5
+"""Method 3 needs one motion twice: where the robot's own torque differs by such a share of itself, it is another."""
 
 METHODS = {
     1: "robot first, then the human from the rest of the torque, eq. (12)",
@@ -58,8 +59,13 @@ class Separation(eqx.Module):
     """(N, *n) which of the rows that were solved count."""
     human: tuple[int, ...] = eqx.field(static=True)
     """Which of the parameters that were solved for are the human's."""
+    passed_on: Array | None
+    """(r, M, h) what a change by one of each of the robot's parameters in the recording with the human adds to the
+    human's; None where nobody asked."""
     warning: str = eqx.field(static=True, default="")
-    """Why the method should not be believed here, or nothing."""
+    """What is to be known of the method here, or nothing."""
+    doubts: Mapping[int, str] = eqx.field(static=True, default_factory=dict)
+    """The human's parameters that the method cannot tell here, and why."""
 
 
 Whiten = Callable[[AnyArray, AnyArray, AnyArray], White]
@@ -96,47 +102,56 @@ def separate(
     noise: Num[AnyArray, "..."] | None = None,
     room: int | None = None,
     whiten: Whiten | None = None,
+    change: Num[AnyArray, "r r"] | None = None,
+    follow: bool = False,
 ) -> Separation:
     """Identify the human by one of the four methods.
 
     **Arguments:** `robot`, the fit of the robot alone (`fit_robot`); `alone` (R) and `loaded` (RH); `merge`, the map
     of `models.combine(robot, human)` that method 2 needs; `window`, `step`, `noise` and `room`
-    as in `sliding_least_squares`, in rows of the regressions; `whiten` where the noise's shape is to be estimated.
+    as in `sliding_least_squares`, in rows of the regressions; `whiten` where the noise's shape is to be estimated;
+    `change`, the covariance of what the robot's parameters may differ by in RH, beyond the errors of their estimates;
+    `follow` whether `Separation.passed_on` is wanted where no `change` needs it.
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: the paper has methods 1, 2, 3 and 4")
     slide = _Slide(Partial(sliding_least_squares, window=window, step=step, noise=noise, room=room), whiten)
-    torque, n_human = loaded.torque - loaded.robot @ robot.theta, loaded.human.shape[1]
+    differs = change is not None and bool(np.any(np.asarray(change)))
     if method == 1:
-        return Separation(*_robot_first(robot, loaded, torque, slide), torque, loaded.valid, tuple(range(n_human)))
-    if method == 2:
-        human = tuple(np.argmax(np.asarray(merge), axis=0)[-n_human:].tolist())
-        return Separation(*_difference_of_parameters(robot, loaded, merge, slide), torque, loaded.valid, human)
-    alone, loaded, shorter = _same_length(alone, loaded)
-    if method == 3:
-        torque = loaded.torque - alone.torque
-        valid = alone.valid & loaded.valid
-        fit, white = slide(loaded.human, torque, valid)
-        warning = "; ".join(filter(None, [_motions_differ(robot, alone, loaded, torque), shorter]))
-        return Separation(fit, white, torque, valid, tuple(range(n_human)), warning)
-    n_robot, valid = loaded.robot.shape[1], jnp.stack([alone.valid, loaded.valid], axis=1)
-    human, torque = tuple(range(n_robot, n_robot + n_human)), torque[: len(loaded.torque)]
-    return Separation(*_augmented(alone, loaded, slide), torque, valid, human, shorter)
+        found = _robot_first(robot, loaded, slide)
+    elif method == 2:
+        found = _difference_of_parameters(robot, loaded, merge, slide)
+    else:
+        alone, loaded, shorter = _same_length(alone, loaded)
+        by_method = _same_motion if method == 3 else _augmented
+        found = by_method(robot, alone, loaded, slide, differs or follow)
+        found = replace(found, warning="; ".join(filter(None, [found.warning, shorter])))
+    if not differs:
+        return found
+    inherited = jnp.einsum("rmh,rs,smh->mh", found.passed_on, jnp.asarray(change), found.passed_on)
+    return replace(found, fit=_with_inherited_variance(found.fit, inherited, jnp.inf))
 
 
 def robot_columns(
-    method: int, missing: tuple[AnyArray, AnyArray], weights: AnyArray, loaded: Regression
+    method: int,
+    missing: tuple[AnyArray, AnyArray],
+    weights: AnyArray,
+    alone: Regression,
+    loaded: Regression,
 ) -> dict[int, AnyArray]:
     """What columns that the robot's model lacks leave in the rows of a method, by the output on which they act.
 
     **Arguments:** `missing` (N, g) in the recordings R and RH; `weights` (r, g) with which the robot's own parameters
-    imitate them in R, as methods 1 and 2 begin; `loaded` RH.
+    imitate them in R, as methods 1 to 3 begin; `alone` R; `loaded` RH.
     """
-    alone, held = missing
+    in_alone, held = missing
     if method in (1, 2):
         return {-1: held - np.asarray(loaded.robot) @ weights}
-    n = min(len(alone), len(held))
-    return {-1: held[:n] - alone[:n]} if method == 3 else {0: alone[:n], 1: held[:n]}
+    n = min(len(in_alone), len(held))
+    if method == 4:
+        return {0: in_alone[:n], 1: held[:n]}
+    moved = np.asarray(loaded.robot)[:n] - np.asarray(alone.robot)[:n]
+    return {-1: held[:n] - in_alone[:n] - moved @ weights}
 
 
 @dataclass(frozen=True)
@@ -158,15 +173,23 @@ class _Slide:
         return from_white(fit, ordinary, white), white
 
 
-def _robot_first(robot: WindowFit, loaded: Regression, torque: Array, slide: _Slide) -> tuple[SlidingFit, White | None]:
+def _robot_first(robot: WindowFit, loaded: Regression, slide: _Slide) -> Separation:
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
+    torque, n_human = loaded.torque - loaded.robot @ robot.theta, loaded.human.shape[1]
     fit, white = slide(loaded.human, torque, loaded.valid)
-    human, columns = loaded.human, loaded.robot
-    if white is not None and white.as_filtered is None:
-        human, columns = jnp.asarray(white.W), jnp.asarray(white.apply(columns, loaded.valid))
-    passed_on = _explained_by_the_human(slide.plain, human, columns, loaded.valid)
+    passed_on = _imitated(slide, white, loaded.human, loaded.robot, loaded.valid)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
-    return _with_inherited_variance(fit, inherited, robot.dof), white
+    fit = _with_inherited_variance(fit, inherited, robot.dof)
+    return Separation(fit, white, torque, loaded.valid, tuple(range(n_human)), passed_on)
+
+
+def _imitated(slide: _Slide, white: White | None, W: Array, columns: Array, valid: Array) -> Array:
+    """(r, M, p) the parameters that imitate each of the columns (N, r), which act on the last output."""
+    if white is not None and white.as_filtered is None:
+        W, columns = jnp.asarray(white.W), jnp.asarray(white.apply(columns, valid if valid.ndim == 1 else valid[:, -1]))
+    if W.ndim == 3:
+        columns = jnp.stack([jnp.zeros_like(columns), columns], axis=1)
+    return _explained_by_the_human(slide.plain, W, columns, valid)
 
 
 @eqx.filter_jit
@@ -176,7 +199,7 @@ def _explained_by_the_human(slide: Callable[..., SlidingFit], human: Array, colu
     def response(column: Array) -> Array:
         return slide(human, column, valid=valid, noise=None).theta
 
-    return jax.lax.map(response, columns.T)
+    return jax.lax.map(response, jnp.moveaxis(columns, -1, 0))
 
 
 def _difference_of_parameters(
@@ -184,7 +207,7 @@ def _difference_of_parameters(
     loaded: Regression,
     merge: tuple[tuple[float, ...], ...],
     slide: _Slide,
-) -> tuple[SlidingFit, White | None]:
+) -> Separation:
     """Method 2. `merge` says which column of the merged model each parameter went into."""
     place = np.argmax(np.asarray(merge), axis=0)
     n_robot = loaded.robot.shape[1]
@@ -205,10 +228,30 @@ def _difference_of_parameters(
         ),
     )
     inherited = jnp.broadcast_to(shared @ robot_variance, human.theta.shape)
-    return _with_inherited_variance(human, inherited, robot.dof), white
+    passed_on = jnp.broadcast_to(jnp.asarray(shared.T[:, None, :], float), (n_robot, *human.theta.shape))
+    fit, torque = _with_inherited_variance(human, inherited, robot.dof), loaded.torque - loaded.robot @ robot.theta
+    return Separation(fit, white, torque, loaded.valid, tuple(human_place.tolist()), passed_on)
 
 
-def _augmented(alone: Regression, loaded: Regression, slide: _Slide) -> tuple[SlidingFit, White | None]:
+def _same_motion(
+    robot: WindowFit, alone: Regression, loaded: Regression, slide: _Slide, follow: bool = False
+) -> Separation:
+    """Method 3. What the robot's torque differs by, since no motion is quite the same twice, is that of its model."""
+    moved, human = loaded.robot - alone.robot, loaded.human
+    torque, valid = loaded.torque - alone.torque - moved @ robot.theta, alone.valid & loaded.valid
+    fit, white = slide(human, torque, valid)
+    imitated = _imitated(slide, white, human, moved, valid)
+    inherited = jnp.einsum("rmh,rs,smh->mh", imitated, robot.covariance, imitated)
+    fit = _with_inherited_variance(fit, inherited, robot.dof)
+    taken_off = np.einsum("rmh,r->mh", np.asarray(imitated), np.asarray(robot.theta))
+    warning, doubts = _motions_differ(robot, alone, loaded, fit, taken_off)
+    passed_on = _imitated(slide, white, human, loaded.robot, valid) if follow else None
+    return Separation(fit, white, torque, valid, tuple(range(human.shape[1])), passed_on, warning, doubts)
+
+
+def _augmented(
+    robot: WindowFit, alone: Regression, loaded: Regression, slide: _Slide, follow: bool = False
+) -> Separation:
     """Method 4: the two recordings are two outputs that share the robot's parameters."""
     upper = jnp.concatenate([alone.robot, jnp.zeros_like(loaded.human)], axis=1)
     lower = jnp.concatenate([loaded.robot, loaded.human], axis=1)
@@ -222,10 +265,12 @@ def _augmented(alone: Regression, loaded: Regression, slide: _Slide) -> tuple[Sl
         fit,
         (fit.theta[:, n_robot:], fit.stderr[:, n_robot:], fit.excitation[:, n_robot:]),
     )
-    return human, white
+    passed_on = _imitated(slide, white, W, loaded.robot, valid)[..., n_robot:] if follow else None
+    torque = loaded.torque - loaded.robot @ robot.theta
+    return Separation(human, white, torque, valid, tuple(range(n_robot, W.shape[-1])), passed_on)
 
 
-def _with_inherited_variance(fit: SlidingFit, inherited: Array, robot_dof: Array) -> SlidingFit:
+def _with_inherited_variance(fit: SlidingFit, inherited: Array, robot_dof: Array | float) -> SlidingFit:
     """Add the variance that comes from the robot's parameters; degrees of freedom by Welch and Satterthwaite."""
     own = fit.stderr**2
     total = own + inherited
@@ -240,15 +285,45 @@ def _same_length(alone: Regression, loaded: Regression) -> tuple[Regression, Reg
     return (*(jax.tree.map(lambda x: x[:n], part) for part in (alone, loaded)), note)
 
 
-def _motions_differ(robot: WindowFit, alone: Regression, loaded: Regression, human_torque: Array) -> str:
-    """Method 3 takes the robot's torque from the other recording: say so where that is not the torque of this one."""
+def _motions_differ(
+    robot: WindowFit, alone: Regression, loaded: Regression, fit: SlidingFit, taken_off: Num[AnyArray, "M h"]
+) -> tuple[str, dict[int, str]]:
+    """What a difference of the motions does to method 3: a note, and which parameters it leaves in doubt.
+
+    **Arguments:** `taken_off`, what the difference of the robot's torque would add to the human's parameters.
+
+    What the robot's model leaves of its torque goes with the motion too, and is not taken off: it is taken for the same
+    share of what is.
+    """
     both = np.asarray(alone.valid & loaded.valid)
-    mismatch = np.asarray((loaded.robot - alone.robot) @ robot.theta)[both]
-    size, human = float(np.sqrt(np.mean(mismatch**2))), float(np.std(np.asarray(human_torque)[both]))
-    if size <= SAME_MOTION * human:
-        return ""
-    share = size / human if human > 0 else np.inf
+    theta, of_alone, of_loaded = (np.asarray(x) for x in (robot.theta, alone.robot, loaded.robot))
+    differs, own = (_rms((x @ theta)[both]) for x in (of_loaded - of_alone, of_loaded))
+    left, whole = (_rms(x[both]) for x in (np.asarray(alone.torque) - of_alone @ theta, np.asarray(alone.torque)))
+    n_human = taken_off.shape[1]
+    if differs > OTHER_MOTION * own:
+        why = (
+            f"the two motions differ: they are two motions and not one, as method 3 needs it (the robot's own torque "
+            f"differs by {differs / max(own, np.finfo(float).tiny):.0%})"
+        )
+        return why, dict.fromkeys(range(n_human), why)
+    known = np.isfinite(taken_off).all(axis=1) & np.isfinite(np.asarray(fit.theta)).all(axis=1)
+    if not known.any():
+        return "", {}
+    usual, error, off = (np.median(np.abs(np.asarray(x)[known]), axis=0) for x in (fit.theta, fit.stderr, taken_off))
+    beyond = off * left / max(whole, np.finfo(float).tiny)
+    doubts = {
+        k: f"the two motions differ: the robot's own torque would change it by {off[k] / usual[k]:.0%}, and the "
+        f"robot's model, which takes that off, leaves {left / whole:.0%} of the robot's torque unexplained"
+        for k in range(n_human)
+        if usual[k] > 0 and beyond[k] > max(ERRORS * error[k], SHARE * usual[k])
+    }
+    if not (off > error).any():
+        return "", doubts
     return (
-        f"the two motions differ: the robot's own torque differs between them by {share:.0%} of the human's torque "
-        f"(at most {SAME_MOTION:.0%} is meant), so method 3 does not hold here"
-    )
+        f"the two motions differ: by the robot's model its own torque differs by {differs / own:.1%}, which was taken "
+        "off; standard errors hold what is not known of it"
+    ), doubts
+
+
+def _rms(x: Num[AnyArray, " N"]) -> float:
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0

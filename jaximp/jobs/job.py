@@ -29,7 +29,7 @@ from jaximp.posterior.priors import LogNormal, Normal
 from jaximp.recordings.load import recording_from_mapping
 from jaximp.trust import plausibility
 from jaximp.trust.limits import TrustLimits
-from jaximp.types import Recording, nearest
+from jaximp.types import Recording, RobotAlone, nearest
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,10 @@ class ModelSettings:
     torque moves it too (it is driven by a torque, or the rig yields). The estimates of a free joint are instrumental
     variables, by the column that `command` or, without it, `reference` maps. Without this key the motion is taken as
     imposed; a note says so."""
+    robot_drift: float | dict[str, float] | None = None
+    """With a robot and a human: by what share the robot's parameters may have changed between the recordings, as one
+    standard deviation. A number is for those that the human has too (viscous friction, inertia), which nothing else can
+    tell; a table names parameters, as in `{ viscous_friction = 0.1, inertia = 0 }`. The human's errors grow by it."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,8 @@ class WindowJob:
     trust: TrustLimits = field(default_factory=TrustLimits)
     robot_recording: Mapping[str, Any] | None = None
     """The recording of the robot alone, for the four methods."""
+    robot_recording_after: Mapping[str, Any] | None = None
+    """A second one, made after the recording with the human."""
     reference_period: float | None = None
     """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
     design: str | None = None
@@ -153,9 +159,14 @@ class WindowJob:
         """
         return recording_from_mapping(self.recording, self.folder)
 
-    def load_robot_alone(self) -> Recording | None:
-        """The recording of the robot alone, where the job has one."""
-        return None if self.robot_recording is None else recording_from_mapping(self.robot_recording, self.folder)
+    def load_robot_alone(self) -> RobotAlone:
+        """The recording of the robot alone, where the job has one; both of them where it has two."""
+        if self.robot_recording is None:
+            return None
+        before = recording_from_mapping(self.robot_recording, self.folder)
+        if self.robot_recording_after is None:
+            return before
+        return before, recording_from_mapping(self.robot_recording_after, self.folder)
 
     def load_design(self) -> FourierSeries | None:
         """The motion that was designed, where the job names one."""
@@ -163,7 +174,7 @@ class WindowJob:
 
     def files(self) -> list[Path]:
         """What the job reads."""
-        tables = (self.recording, self.robot_recording or {})
+        tables = (self.recording, self.robot_recording or {}, self.robot_recording_after or {})
         names = [str(table["file"]) for table in tables if "file" in table]
         return [self.folder / name for name in (*names, self.design) if name is not None]
 
@@ -195,6 +206,7 @@ class WindowJob:
             limits=self._limits(len(joints)),
             robot=None if human is None else robot,
             methods=self.model.methods,
+            robot_drift=self.model.robot_drift,
             reference=self.load_design() or self.reference_period,
             drive=self.model.drive,
         )
@@ -263,19 +275,21 @@ def read_job(path: str | Path) -> Job:
 def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
-    known = ["recording", "robot_recording", "model", "window", "filter", "trust", "reference_period", "design"]
+    recordings = ["recording", "robot_recording", "robot_recording_after"]
+    known = [*recordings, "model", "window", "filter", "trust", "reference_period", "design"]
     check_keys(tables, [*known, "posterior", "trials"], "the job")
     if "trials" in tables:
         return _job_of_trials(tables, folder, text)
     for required in ("recording", "model", "window"):
         if required not in tables:
             raise ValueError(f"the job has no [{required}] table: add one")
-    for table in ("recording", "robot_recording"):
+    for table in recordings:
         if table in tables and not isinstance(tables[table], dict):
             raise ValueError(f"[{table}] must be a table")
     job = WindowJob(
         recording=tables["recording"],
         robot_recording=tables.get("robot_recording"),
+        robot_recording_after=tables.get("robot_recording_after"),
         model=model_settings(tables["model"]),
         window=settings(WindowSettings, tables["window"], "window"),
         filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
@@ -332,7 +346,7 @@ def posterior_settings(table: Any) -> PosteriorSettings:
 def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
-    check_keys(table, ["human", "robot", "arm", "methods", "drive"], "[model]")
+    check_keys(table, ["human", "robot", "arm", "methods", "drive", "robot_drift"], "[model]")
     robot = optional(RobotSettings, table.get("robot", False), "model.robot")
     human = optional(HumanSettings, table.get("human", False), "model.human")
     arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])
@@ -348,7 +362,23 @@ def model_settings(table: Any) -> ModelSettings:
     drive = table.get("drive")
     if drive is not None and drive not in DRIVES:
         raise ValueError(f"model.drive is {drive!r}: {nearest(str(drive), DRIVES)}")
-    return ModelSettings(human, robot, arm, methods=tuple(dict.fromkeys(methods)), drive=drive)
+    drift = _robot_drift(table.get("robot_drift"), human, robot)
+    return ModelSettings(human, robot, arm, tuple(dict.fromkeys(methods)), drive, drift)
+
+
+def _robot_drift(
+    value: Any, human: HumanSettings | None, robot: RobotSettings | None
+) -> float | dict[str, float] | None:
+    """A share, or one for each of some parameters."""
+    if value is None:
+        return None
+    if human is None or robot is None:
+        raise ValueError("model.robot_drift is of use only with both model.robot and model.human")
+    for name, share in value.items() if isinstance(value, dict) else [("", value)]:
+        where = f"model.robot_drift.{name}" if name else "model.robot_drift"
+        if not 0 <= checked(share, float, where) < math.inf:
+            raise ValueError(f"{where} is {share}: it is a share, such as 0.03, and must be zero or more")
+    return {name: float(share) for name, share in value.items()} if isinstance(value, dict) else float(value)
 
 
 def _check_values(job: WindowJob) -> None:
@@ -359,6 +389,8 @@ def _check_values(job: WindowJob) -> None:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
     if not both and job.robot_recording is not None:
         raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
+    if job.robot_recording_after is not None and job.robot_recording is None:
+        raise ValueError("[robot_recording_after] is the second of two: add the first as [robot_recording]")
     if job.model.human is not None:
         for names in (job.model.human.joint_name, job.trust.joint_name):
             for name in names if isinstance(names, list) else [names]:

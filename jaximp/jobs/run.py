@@ -12,7 +12,7 @@ from jaximp.jobs.run_trials import identify_trials, infer_trials
 from jaximp.perturbation.trials_result import TrialsResult
 from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.inference import Inference, posterior_of
-from jaximp.types import Progress, Recording
+from jaximp.types import Progress, Recording, RobotAlone
 
 
 def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimates] | TrialsResult:
@@ -28,13 +28,13 @@ def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimate
 
 
 def identify_recording(
-    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
 ) -> list[Estimates]:
-    """As `identify`, for recordings that are in memory."""
+    """As `identify`, for recordings that are in memory; `alone` may be two, before and after the human's."""
     return estimate(job.pipeline_for(recording), recording, alone, progress)
 
 
-def prepare(job: WindowJob, recording: Recording | None = None, alone: Recording | None = None) -> Prepared:
+def prepare(job: WindowJob, recording: Recording | None = None, alone: RobotAlone = None) -> Prepared:
     """Read the recordings of a job (or take these) and filter them: rows for least squares, windows still to come."""
     if recording is None:
         recording, alone = job.load(), job.load_robot_alone()
@@ -42,7 +42,7 @@ def prepare(job: WindowJob, recording: Recording | None = None, alone: Recording
 
 
 def check(
-    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
 ) -> tuple[list[Finding], Proposal]:
     """Look at a recording for the model of a job, and propose cut-offs and a window."""
     return check_recording(job.pipeline_for(recording), recording, alone, progress)
@@ -60,7 +60,7 @@ def infer(job: Job, progress: Progress = lambda share: None) -> Inference | ArmI
 
 
 def infer_recording(
-    job: WindowJob, recording: Recording, alone: Recording | None = None, progress: Progress = lambda share: None
+    job: WindowJob, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
 ) -> Inference:
     """As `infer`, for recordings that are in memory."""
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)

@@ -64,7 +64,7 @@ from jaximp.posterior.priors import LogNormal, MultivariateNormal, Normal, Prior
 from jaximp.results import Column, Result
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import POOR, TRUSTED, UNCONVERGED, WEAK, Rule, Verdict, Verdicts, judge_one
-from jaximp.types import AnyArray, Numbers, Progress, Recording
+from jaximp.types import AnyArray, Numbers, Progress, Recording, RobotAlone
 
 CONTRADICTION = 1e-3
 """Windows, or estimates, that differ more than this is probable contradict each other."""
@@ -344,7 +344,7 @@ def posterior_of(
     pipeline: Pipeline,
     settings: PosteriorSettings,
     recording: Recording,
-    alone: Recording | None = None,
+    alone: RobotAlone = None,
     progress: Progress = lambda share: None,
 ) -> Inference:
     """Posteriors of a recording: of its whole record, and of windows that share no sample.
@@ -563,12 +563,13 @@ def _data(settings: PosteriorSettings, prepared: Prepared) -> _Data:
 
 
 def _prior(settings: PosteriorSettings, prepared: Prepared, model: Model, outputs: int) -> Prior:
-    """As it is given; and of the robot, what its own recording tells."""
+    """As it is given; and of the robot, what its own recordings tell, and how far it may have changed."""
     blocks = []
     if prepared.pair is not None:
         robot, fit = prepared.pair.robot, prepared.pair.robot_fit
         names = model.names[: len(robot.names)]
-        blocks = [MultivariateNormal(names, np.asarray(fit.theta), np.asarray(fit.covariance))]
+        covariance = np.asarray(fit.covariance) + prepared.pair.change
+        blocks = [MultivariateNormal(names, np.asarray(fit.theta), covariance)]
     return make_prior((*model.names, *noise_names(outputs)), settings.prior, blocks)
 
 

@@ -110,6 +110,18 @@ def score_groups(
     return [one for one in found if one is not None]
 
 
+def added_weights(W: Numbers, columns: Numbers, fit: DisjointFit, every: int = 1) -> tuple[Numbers, Numbers, float]:
+    """Weights (g,) of further columns (N, g) by one fit with parameters of their own in all windows, their covariance
+    (g, g) and degrees of freedom; arguments as of `score_groups`. Where nothing tells them, the covariance is NaN."""
+    sums, g = _sums(W, [columns], fit, every), columns.shape[1]
+    size = np.where(sums.size > 0, sums.size, 1)
+    gram = sums.gram / size / size[:, None]
+    if sums.freedom <= g or np.linalg.eigvalsh(gram)[0] <= LOST:
+        return np.zeros(g), np.full((g, g), np.nan), sums.freedom
+    inverse = np.linalg.inv(gram) / size / size[:, None]
+    return inverse @ sums.score, inverse @ sums.spread @ inverse, sums.freedom
+
+
 def with_say(fit: DisjointFit, every: int) -> NDArray[np.int64]:
     """Windows that are determined, and move enough against the others that their parameters are not free to go
     anywhere."""
