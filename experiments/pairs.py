@@ -1,7 +1,7 @@
 """A human in a robot: do 95 % intervals hold the truth where the motions differ, or the robot does?
 
-The rig of Tout et al. 2023 with its controller, alone and held, 60 s each: the human, the share by which the motions
-differ, and what changes of the robot are drawn for every pair. Windows of 2 s side by side. Writes
+The ankle of `ankles` in a robot with friction and gravity, 60 s alone and 60 s together: motion, noise, the human, by
+how much the motions differ, and what changes of the robot are drawn for every pair. Windows of 2 s side by side. Writes
 experiments/results/pairs.json and pairs.md.
 
     python experiments/pairs.py [--pairs 60] [--cases NAME ...]
@@ -16,27 +16,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
+import ankles
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
-from jaximp.identification import FilterSettings, WindowSettings
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
 from jaximp.identification.pipeline import Pipeline
-from jaximp.models import HumanJoint, RobotJoint
-from jaximp.motion.trajectories import FourierSeries
-from jaximp.simulation.rig import HUMAN_TRAJECTORY, HumanLoad, Rig, record, simulate_rig
-from jaximp.trust.limits import TrustLimits
+from jaximp.models import RobotJoint
+from jaximp.recordings import recording_from_arrays
 from jaximp.types import Recording, RobotAlone
 
 jax.config.update("jax_enable_x64", True)
 
-PAIRS, SECONDS, RATIO = 60, 60.0, 15.0
+Numbers = NDArray[np.float64]
+PAIRS, SECONDS, RATE = 60, 60.0, 500.0
 NAMES = ("inertia", "damping", "stiffness")
-USUAL = {"inertia": 4e-5, "damping": 2e-4, "stiffness": 2e-3}
-"""Of the human, at the motor."""
-OWN = {"coulomb_friction", "gravity_x", "gravity_y"}
+ROBOT = {"gravity_x": 0.3, "gravity_y": 0.05, "viscous_friction": 0.4, "coulomb_friction": 0.8, "inertia": 0.015}
+MOTIONS, NOISES = ("random", "multisine"), ("white", "pink", "AR(1) of 50 ms")
 FOLDER = Path(__file__).parent / "results"
 
 
@@ -71,52 +69,51 @@ CASES: dict[str, Case] = {
 }
 
 
-def motion_of(random: np.random.Generator, share: float) -> FourierSeries:
-    """The usual one, larger by such a share and with every harmonic turned; or another one."""
-    usual = HUMAN_TRAJECTORY
-    sine, cosine = np.asarray(usual.sine), np.asarray(usual.cosine)
-    turn = random.normal(size=len(sine)) * (share if share < 1 else np.pi)
-    size = 1 + share * random.choice([-1, 1]) * (share < 1)
-    turned = (
-        size * (np.cos(turn) * sine - np.sin(turn) * cosine),
-        size * (np.sin(turn) * sine + np.cos(turn) * cosine),
-    )
-    return eqx.tree_at(lambda f: (f.sine, f.cosine), usual, turned)
+def motion_like(random: np.random.Generator, motion: ankles.Motion, name: str, share: float) -> ankles.Motion:
+    """One whose every frequency differs by such a share; or another one."""
+    if share >= 1:
+        return ankles.move(random, name, RATE, SECONDS)
+    lines = random.normal(size=(2, len(motion.spectrum))) / np.sqrt(2)
+    return replace(motion, spectrum=motion.spectrum * (1 + share * (lines[0] + 1j * lines[1])))
 
 
-def changed(rig: Rig, shares: Mapping[str, float]) -> Rig:
-    return replace(rig, **{name: getattr(rig, name) * (1 + share) for name, share in shares.items()})
+def changed(shares: Mapping[str, float]) -> dict[str, float]:
+    return {name: value * (1 + shares.get(name, 0)) for name, value in ROBOT.items()}
+
+
+def recorded(motion: ankles.Motion, noise: Numbers, robot: Mapping[str, float], human: Numbers) -> Recording:
+    """A robot, and a human (inertia, damping, stiffness, offset) that may be zero."""
+    q, dq, ddq = motion.position, motion.velocity, motion.through(lambda s: s**2)
+    rows = RobotJoint().regressor(q, dq, ddq)
+    torque = np.asarray(rows) @ np.array(list(robot.values()))
+    torque = torque + np.stack([ddq, dq, q, np.ones_like(q)], axis=1) @ human
+    return recording_from_arrays(np.arange(len(q)) / RATE, q, torque + noise)
 
 
 def pair(random: np.random.Generator, case: Case) -> tuple[Recording, RobotAlone, dict[str, float]]:
     """The robot with the human, the robot alone, and the truth."""
-    truth = {name: usual * float(np.exp(random.normal(0, 0.3))) for name, usual in USUAL.items()}
-    rig = replace(Rig(), gravity_y=3e-4)
+    truth = {name: ankles.TRUTH[name] * float(np.exp(random.normal(0, 0.3))) for name in NAMES}
+    human = np.array([*truth.values(), ankles.TRUTH["offset_torque"]])
+    name, noise = str(random.choice(MOTIONS)), str(random.choice(NOISES))
     moved = {name: sd * float(random.normal()) for name, sd in (case.changes or {}).items()} | dict(case.shift or {})
     at = float(random.random()) if case.after else 1.0
-    human = HumanLoad(stiffness_after=truth["stiffness"], **truth)
-    keys = jax.random.split(jax.random.key(int(random.integers(1 << 31))), 3)
-    first = motion_of(random, random.uniform(*case.motion))
-    held = simulate_rig(changed(rig, {name: at * share for name, share in moved.items()}), HUMAN_TRAJECTORY, SECONDS,
-                        human, key=keys[0])  # fmt: skip
-    alone: RobotAlone = record(simulate_rig(rig, first, SECONDS, key=keys[1]), "before")
+    motion = ankles.move(random, name, RATE, SECONDS)
+    first = motion_like(random, motion, name, random.uniform(*case.motion))
+    now = changed({name: at * share for name, share in moved.items()})
+    level = ankles.NOISE * float(np.exp(random.uniform(np.log(0.1), 0)))
+    noises = [level * ankles.NOISES[noise](random, one) for one in (motion, first, first)]
+    held = recorded(motion, noises[0], now, human)
+    alone: RobotAlone = recorded(first, noises[1], ROBOT, 0 * human)
     if case.after:
         assert isinstance(alone, Recording)
-        alone = alone, record(simulate_rig(changed(rig, moved), first, SECONDS, key=keys[2]), "after")
-    return record(held, "held"), alone, truth
+        alone = alone, recorded(first, noises[2], changed(moved), 0 * human)
+    return held, alone, truth
 
 
 def pipeline(case: Case) -> Pipeline:
-    return Pipeline(
-        1000.0,
-        HumanJoint(gear_ratio=RATIO),
-        WindowSettings(2.0, 2.0, min_velocity=0.1),
-        FilterSettings(position_cutoff=20, decimation_cutoff=10),
-        TrustLimits(joint_name="other"),
-        RobotJoint(RATIO),
-        case.methods,
-        robot_drift=case.drift,
-    )
+    usual = ankles.pipeline(RATE, 2.0)
+    window = replace(usual.window, step=2.0)
+    return replace(usual, window=window, robot=RobotJoint(), methods=case.methods, robot_drift=case.drift)
 
 
 def judged(found: Estimates, truth: Mapping[str, float]) -> dict[str, Any]:

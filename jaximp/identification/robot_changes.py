@@ -144,7 +144,8 @@ class Sameness:
     def in_words(self) -> str:
         """Which parameters differ, and by how much."""
         if not self.differs:
-            return f"{listed(self.names)} agree in both recordings ({p_in_words(self.p)})"
+            agree = "agrees" if len(self.names) == 1 else "agree"
+            return f"{listed(self.names)} {agree} in both recordings ({p_in_words(self.p)})"
         changes = _changes(self.names, self.usual, self.difference, self.covariance)
         return f"the robot is not the same in both recordings ({p_in_words(self.p)}): {changes} in that with the human"
 
@@ -209,11 +210,13 @@ def _chance(difference: Numbers, covariance: Numbers, freedom: float) -> float:
 
 
 def _changes(names: Sequence[str], usual: Numbers, difference: Numbers, covariance: Numbers) -> str:
-    """Each parameter that differs beyond its error, or the one that does most."""
+    """Each parameter that differs beyond chance, of all of them, or the one that does most."""
+    from scipy.special import ndtri
+
     errors = np.sqrt(np.diagonal(covariance))
     z = np.abs(difference) / np.where(errors > 0, errors, np.inf)
     said = []
-    for k in np.flatnonzero(z >= min(ERRORS, z.max())).tolist():
+    for k in np.flatnonzero(z >= min(-ndtri(FAMILYWISE / 2 / len(z)), z.max())).tolist():
         known = abs(usual[k]) > ERRORS * errors[k]
         said.append(
             f"{names[k]} by {difference[k] / abs(usual[k]):+.1%}" if known else f"{names[k]} by {difference[k]:+.2g}"

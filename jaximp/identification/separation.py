@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaximp.identification.whitening import White, from_filtered, from_white, with_sizes_of_one
 from jaximp.least_squares.sliding import sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit, least_squares
+from jaximp.numerics.compilation import is_traced
 from jaximp.trust.score_tests import ERRORS, SHARE
 from jaximp.types import AnyArray
 
@@ -243,8 +244,7 @@ def _same_motion(
     imitated = _imitated(slide, white, human, moved, valid)
     inherited = jnp.einsum("rmh,rs,smh->mh", imitated, robot.covariance, imitated)
     fit = _with_inherited_variance(fit, inherited, robot.dof)
-    taken_off = np.einsum("rmh,r->mh", np.asarray(imitated), np.asarray(robot.theta))
-    warning, doubts = _motions_differ(robot, alone, loaded, fit, taken_off)
+    warning, doubts = _motions_differ(robot, alone, loaded, fit, jnp.einsum("rmh,r->mh", imitated, robot.theta))
     passed_on = _imitated(slide, white, human, loaded.robot, valid) if follow else None
     return Separation(fit, white, torque, valid, tuple(range(human.shape[1])), passed_on, warning, doubts)
 
@@ -293,8 +293,11 @@ def _motions_differ(
     **Arguments:** `taken_off`, what the difference of the robot's torque would add to the human's parameters.
 
     What the robot's model leaves of its torque goes with the motion too, and is not taken off: it is taken for the same
-    share of what is.
+    share of what is. While tracing nothing is known yet.
     """
+    if is_traced(alone.torque, loaded.torque, taken_off):
+        return "", {}
+    taken_off = np.asarray(taken_off)
     both = np.asarray(alone.valid & loaded.valid)
     theta, of_alone, of_loaded = (np.asarray(x) for x in (robot.theta, alone.robot, loaded.robot))
     differs, own = (_rms((x @ theta)[both]) for x in (of_loaded - of_alone, of_loaded))

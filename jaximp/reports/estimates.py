@@ -324,12 +324,22 @@ def _comparison(head: str, main: str, results: Mapping[str, dict[str, Any]]) -> 
 def _robot_alone(content: dict[str, Any]) -> list[Section]:
     if not content["robot"]:
         return []
-    columns = [Column("Parameter", "text"), Column("Estimate"), Column("Standard error"), Column("Unit", "text")]
+    heads = "Estimate", "Standard error", "May have changed by"
+    columns = [Column("Parameter", "text"), *map(Column, heads), Column("Unit", "text")]
     rows = [
-        [words(name), digits(value["value"]), digits(value["stderr"], 2), pretty_unit(value["unit"])]
+        [
+            words(name),
+            digits(value["value"]),
+            *(digits(value[key], 2) for key in ("stderr", "may_change")),
+            pretty_unit(value["unit"]),
+        ]
         for name, value in content["robot"].items()
     ]
-    return [Section("Robot alone", [Table(columns, rows)])]
+    told = (
+        "What the robot may have changed by until the recording with the human is one standard deviation, by a second "
+        "recording of the robot alone or by robot_drift; the human's standard errors hold it."
+    )
+    return [Section("Robot alone", [Table(columns, rows, remark=told)])]
 
 
 def _tests(content: dict[str, Any]) -> list[Section]:
@@ -548,9 +558,13 @@ def _robot(estimates: Estimates, robot: Model | None) -> dict[str, dict[str, Any
         robot.units,
         np.asarray(estimates.robot.theta),
         np.asarray(estimates.robot.stderr),
+        np.zeros(len(robot.names)) if estimates.robot_change is None else estimates.robot_change,
         strict=True,
     )
-    return {name: {"unit": unit, "value": theta, "stderr": stderr} for name, unit, theta, stderr in values}
+    return {
+        name: {"unit": unit, "value": theta, "stderr": stderr, "may_change": change}
+        for name, unit, theta, stderr, change in values
+    }
 
 
 def _example(estimates: Estimates, verdict: str) -> str:
