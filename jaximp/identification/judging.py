@@ -315,7 +315,9 @@ class _OfModel:
         found = dict.fromkeys(text for name, text in doubts.of.items() if name in judged)
         why = "; ".join(filter(None, [self.why, *found]))
         remedy = "; or ".join(dict.fromkeys(filter(None, [self.remedy, doubts.remedy if found else ""])))
-        lacking = {**doubts.of, **self.lacking}
+        lacking = self.lacking | {
+            name: "; ".join(filter(None, [self.lacking.get(name, ""), text])) for name, text in doubts.of.items()
+        }
         moves = self.moves if doubts.moves is None else np.hypot(self.moves, doubts.moves)
         return replace(self, why=why, remedy=remedy, lacking=lacking, moves=moves)
 
