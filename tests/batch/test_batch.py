@@ -22,6 +22,7 @@ from jaximp.jobs.run import identify_recording
 from jaximp.least_squares import sliding as windows
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.recordings.save import save_recording
+from jaximp.types import Recording
 
 
 def test_the_data_set_holds_what_identify_finds(study: Path) -> None:
@@ -160,8 +161,33 @@ def test_a_new_recording_of_the_robot_is_read(tmp_path: Path) -> None:
         recording = joint(1000, seed)
         save_recording(recording, tmp_path / "alone.parquet")
         found = batch_results._alone(task, item)
-        assert found is not None
+        assert isinstance(found, Recording)
         np.testing.assert_array_equal(found.torque, recording.torque)
+
+
+def test_the_robot_afterwards_is_that_of_the_manifest(tmp_path: Path) -> None:
+    """Both are read, in their order, and either one's content makes the results those of another input."""
+    text = JOB.replace("human = true", "human = true\nrobot = { gravity = false, coulomb = false }")
+    columns = "".join(JOB.splitlines(keepends=True)[3:6])
+    text += "".join(
+        f'[{table}]\nfile = "none.parquet"\n{columns}' for table in ("robot_recording", "robot_recording_after")
+    )
+    names = ("held", "before", "after")
+    for seed, name in enumerate(names):
+        save_recording(joint(1000, seed), tmp_path / f"{name}.parquet")
+    rows = "file,robot_file,robot_file_after\n" + ",".join(f"{name}.parquet" for name in names)
+    (tmp_path / "study.csv").write_text(rows + "\n")
+    job = parse_job(text, tmp_path)
+    plan = make_plan(job, find_items([], tmp_path / "study.csv"))
+    ((item,),) = (batch.items for batch in plan.batches)
+    task = batch_results.Task.of(job, plan, tmp_path / "out")
+    found = batch_results._alone(task, item)
+    assert isinstance(found, tuple)
+    for one, seed in zip(found, (1, 2), strict=True):
+        np.testing.assert_array_equal(one.torque, joint(1000, seed).torque)
+    before = batch_results.input_checksum(item)
+    save_recording(joint(1000, 7), tmp_path / "after.parquet")
+    assert batch_results.input_checksum(item) != before
 
 
 def test_all_recordings_of_a_study_have_the_same_joints(tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ def test_the_variable_of_the_sample_rate_is_counted_too(tmp_path: Path) -> None:
         ("file\na.csv\na.csv\n", "more than once"),
         ("file,subject\na.csv\n", "more or fewer fields"),
         ("file,robot_file\na.csv,b.csv\n", "no \\[robot_recording\\]"),
+        ("file,robot_file_after\na.csv,b.csv\n", "no \\[robot_recording_after\\]"),
         ("file,verdict\na.csv,x\n", "name of a result"),
         ("file,stiffness_stderr\na.csv,x\n", "name of a result"),
         ("file,stiffness_mean\na.csv,x\n", "name of a result"),
