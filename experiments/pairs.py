@@ -129,7 +129,6 @@ def judged(found: Estimates, truth: Mapping[str, float]) -> dict[str, Any]:
         "off": np.median(found.value[:, :3] / value - 1, axis=0).tolist(),
         "stderr": np.median(found.stderr[:, :3] / value, axis=0).tolist(),
         "reason": next((str(r) for r in found.verdicts.reason if r), ""),
-        "notes": [note for note in found.notes if "robot" in note or "motions" in note],
     }
 
 
@@ -176,6 +175,6 @@ if __name__ == "__main__":
     results = {}
     for name in given.cases:
         results[name] = run(name, given.pairs)
-        (FOLDER / "pairs.json").write_text(json.dumps(results, indent=1) + "\n")
+        (FOLDER / "pairs.json").write_text(json.dumps(results) + "\n")
         (FOLDER / "pairs.md").write_text(table(results))
     print(table(results))
