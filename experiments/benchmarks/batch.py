@@ -39,7 +39,7 @@ jax.monitoring.register_event_duration_secs_listener(
 from jaximp.batch import find_items, make_plan  # noqa: E402
 from jaximp.batch import results as batch_results  # noqa: E402
 from jaximp.batch import run as batch  # noqa: E402
-from jaximp.identification import regression  # noqa: E402
+from jaximp.identification import rows as identification_rows  # noqa: E402
 from jaximp.jobs import Job, read_job  # noqa: E402
 from jaximp.recordings import recording_from_arrays, save_recording  # noqa: E402
 
@@ -241,7 +241,7 @@ def main(count: int) -> None:
         results |= {"peak_mb_tenth": memory[0], "peak_mb_all": memory[1], "peak_ratio": memory[1] / memory[0]}
         simulate(top / "lengths", 1000, lengths=True)
         jax.clear_caches()
-        regression._known.clear()
+        identification_rows._known.clear()
         compiled.clear()
         one_run(top / "lengths", job, top / "l")
         results["compilations_1000_lengths"] = len(compiled)

@@ -27,7 +27,7 @@ from jaximp.batch.tables import recordings_table, windows_table
 from jaximp.batch.task import FAILED, About, Result, Task, checksum, file_checksum, input_checksum, job_checksum, load
 from jaximp.identification.identify import in_windows, solve_windows
 from jaximp.identification.prepared import Prepared, prepare, share_of_stack, without_unknown_delay
-from jaximp.identification.regression import Measured, measure, regress_stack
+from jaximp.identification.rows import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import WindowJob
 from jaximp.recordings.errors import UnavailableError

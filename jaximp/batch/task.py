@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from jaximp.batch.plan import MOST_SAMPLES, Batch, Item, Plan, channel_columns, why_refused
 from jaximp.identification.estimates import Estimates
-from jaximp.identification.regression import Measured
+from jaximp.identification.rows import Measured
 from jaximp.jobs.job import WindowJob
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.load import recording_from_mapping

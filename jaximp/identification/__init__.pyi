@@ -12,7 +12,7 @@ from .pipeline import Pipeline as Pipeline
 from .pipeline import WindowSettings as WindowSettings
 from .prepared import Prepared as Prepared
 from .prepared import prepare as prepare
-from .regression import Rows as Rows
+from .rows import Rows as Rows
 from .separation import Regression as Regression
 from .separation import Separation as Separation
 from .separation import fit_robot as fit_robot

@@ -15,8 +15,8 @@ from jaximp.identification.identify import estimate, robot_sameness
 from jaximp.identification.judging import jump_note
 from jaximp.identification.pipeline import NOISE, Pipeline
 from jaximp.identification.prepared import columns_by_joint, prepare
-from jaximp.identification.regression import jumped, once
 from jaximp.identification.robot_changes import NOT_ASKED
+from jaximp.identification.rows import jumped, once
 from jaximp.models.base import combine
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import FAMILYWISE

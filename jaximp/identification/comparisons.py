@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.identification.whitening import White
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaximp import signals
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.identification.whitening import whiten
 from jaximp.types import AnyArray, Numbers
 

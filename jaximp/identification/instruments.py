@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.identification.misfit import Tests
 from jaximp.identification.pipeline import FREELY, IMPOSED, Pipeline
-from jaximp.identification.regression import Rows, measure, measured_motion, regress
+from jaximp.identification.rows import Rows, measure, measured_motion, regress
 from jaximp.identification.suspects import behind_filters
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import SlidingFit

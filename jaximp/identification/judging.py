@@ -29,8 +29,8 @@ from jaximp.identification.misfit import (
 )
 from jaximp.identification.pipeline import FREELY, Pipeline
 from jaximp.identification.prepared import Prepared, has_instruments
-from jaximp.identification.regression import Rows
 from jaximp.identification.robot_changes import NO_DOUBTS, Doubts
+from jaximp.identification.rows import Rows
 from jaximp.identification.solving import Placement, Solved
 from jaximp.identification.suspects import DRIVE
 from jaximp.least_squares.sliding import score

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from jaximp import signals
 from jaximp.identification.filter_settings import Filters, FilterSettings
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows, measured_motion, undisturbed
+from jaximp.identification.rows import Rows, measured_motion, undisturbed
 from jaximp.least_squares.sliding import slice_window, window_starts
 from jaximp.models.base import MOTION, Model
 from jaximp.numerics.cores import cores

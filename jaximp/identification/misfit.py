@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.identification.separation import Regression, Separation, Whiten
 from jaximp.identification.suspects import (
     DRIVE,

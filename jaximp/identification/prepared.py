@@ -16,7 +16,6 @@ from jaximp.identification.instruments import Drive, find_drives
 from jaximp.identification.literal import noise_in_windows, regress_in_windows
 from jaximp.identification.misfit import RobotTests
 from jaximp.identification.pipeline import NOISE, Pipeline, ReferenceMotion
-from jaximp.identification.regression import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.robot_changes import (
     NOT_ASKED,
     between,
@@ -25,6 +24,7 @@ from jaximp.identification.robot_changes import (
     drift_in_words,
     mean_of_both,
 )
+from jaximp.identification.rows import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
 from jaximp.identification.whitening import White, whiten

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from jaximp.identification.literal import rows_away_from_ends
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows, first_call, on_every_device
+from jaximp.identification.rows import Rows, first_call, on_every_device
 from jaximp.identification.whitening import White, from_filtered, from_white
 from jaximp.least_squares.chunks import LONGEST_REACH, finish
 from jaximp.least_squares.chunks import Task as ChunkTask

@@ -13,7 +13,7 @@ from jax import Array
 from jaximp import signals
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import measured_motion
+from jaximp.identification.rows import measured_motion
 from jaximp.models.base import Model
 from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray, Numbers, Recording

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.identification.pipeline import Pipeline
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.least_squares.autoregression import (
     Autoregression,
     autoregression_of,

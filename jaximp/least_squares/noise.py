@@ -330,7 +330,7 @@ def whitened_covariance(
 ) -> Numbers:
     """(n, p, p) covariance that errors of the regressor have in the rows that `whiten` makes with the same arguments.
 
-    **Arguments:** `difference` of a regressor with and without such errors (`identification.regression`).
+    **Arguments:** `difference` of a regressor with and without such errors (`identification.rows`).
     """
     difference = np.asarray(difference, float)
     rows = whiten(difference, np.zeros(difference.shape[:-1]), noise, valid)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 from jaximp.identification.filter_settings import FilterSettings, design_filters
-from jaximp.identification.regression import filtered
+from jaximp.identification.rows import filtered
 from jaximp.least_squares.window import WindowFit, least_squares, variance_accounted_for
 from jaximp.models.arm import PlanarArm
 from jaximp.models.kinematics import ArmGeometry

@@ -17,7 +17,7 @@ from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
 from jaximp.batch.plan import padded_sizes
-from jaximp.identification import regression
+from jaximp.identification import rows as identification_rows
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import in_windows, solve_windows
 from jaximp.identification.prepared import Prepared, columns_by_joint, prepare, share_of_stack
@@ -82,8 +82,8 @@ LONGEST = (
 
 def stacked(job: Job, recordings: list[Recording], padded: int, size: int) -> list[Prepared]:
     """Filtered and solved as a batch does it."""
-    measured = [regression.measure(job.pipeline_for(recording), recording) for recording in recordings]
-    found = regression.regress_stack(measured, padded, size)
+    measured = [identification_rows.measure(job.pipeline_for(recording), recording) for recording in recordings]
+    found = identification_rows.regress_stack(measured, padded, size)
     rows = -(-padded // measured[0].pipeline.filters.decimate)
     return solve_windows([share_of_stack(one, found, k) for k, one in enumerate(measured)], rows, size)
 
@@ -177,7 +177,7 @@ def test_many_lengths_are_few_programs(tmp_path: Path) -> None:
     for k in range(24):
         save_recording(joint(1003 + 17 * k, k), tmp_path / f"r{k:02d}.parquet")
     jax.clear_caches()
-    regression._known.clear()
+    identification_rows._known.clear()
     compilation.options()
     jnp.zeros(())  # small programs that no length has a part in
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -195,7 +195,7 @@ def test_what_stops_a_stack_is_said_of_its_recordings(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(batch_results, "solve_windows", refuse)
     job, recording = parse_job(JOB), joint(1000)
-    measured = regression.measure(job.pipeline_for(recording), recording)
+    measured = identification_rows.measure(job.pipeline_for(recording), recording)
     result = batch_results.Result(batch_plan.Item("x", Path("x")), recording=recording)
     result.stacked = (1000, 1, "kind"), measured
     batch_results._solve_stacks(batch_results.Task(job, Path(), (), (), (), 1), [result])

@@ -16,7 +16,7 @@ from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.identify import estimate, in_windows, solve_windows
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.prepared import prepare
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.identification.whitening import White, ordinary_errors, ordinary_inflation, whiten
 from jaximp.least_squares.autoregression import Autoregression, density_of
 from jaximp.models import HumanJoint

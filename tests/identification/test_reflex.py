@@ -23,7 +23,7 @@ from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import Filters
 from jaximp.identification.identify import in_windows
 from jaximp.identification.prepared import prepare
-from jaximp.identification.regression import measure, regress, undisturbed
+from jaximp.identification.rows import measure, regress, undisturbed
 from jaximp.jobs import parse_job
 from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares.window import least_squares

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import Pipeline, WindowSettings
-from jaximp.identification.regression import Rows
+from jaximp.identification.rows import Rows
 from jaximp.identification.whitening import White, rows_apart, whiten
 from jaximp.models import HumanJoint
 
