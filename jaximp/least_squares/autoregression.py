@@ -167,20 +167,20 @@ def fit_window_noise(
     stretches = _stretches(np.asarray(valid, bool), window, every)
     parameters = W.shape[-1]
     rows = sum(sum(len(run) for run in runs) for runs in stretches) / every
-    typical = np.median([sum(map(len, runs)) for runs in stretches]) / every if stretches else 0
+    typical = np.median([sum(map(len, runs)) for runs in stretches]) if stretches else 0
     longest = max(parameters and (typical - parameters) / ROWS_PER_TERM, 0)
     orders = [k for k in ORDERS if k <= min(longest, rows / FEWEST_WINDOWS) and 2 * k < _usual_run(stretches)]
     if len(orders) < 2:
         return Autoregression(every=every)
     z = np.column_stack([W, y])
-    sums = _sums(z, stretches, orders[-1], every)
+    sums = _sums(z, stretches, orders[-1])
     if sums is None:
         return Autoregression(every=every)
     best, start = (np.inf, np.zeros(0)), np.zeros(0)
     for order in orders:
         start, value = _fit(sums, np.pad(start, (0, order - len(start))))
         small = rows / (rows - order - 1)  # Hurvich and Tsai 1989, for few rows
-        criterion = value + 2 * order * small
+        criterion = value / every + 2 * order * small
         if criterion > best[0] + WORSE:
             break
         best = min(best, (criterion, start), key=lambda one: one[0])
@@ -194,9 +194,11 @@ def _joined(W: Numbers, window: int, every: int) -> tuple[Numbers, int]:
     told = window / every - p
     if not p or not 0 < told < ROWS_PER_TERM * ENOUGH:
         return W, window
-    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, n // window)
+    windows = n // window
+    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, windows)
     if count < 2:
         return W, window
+    count = windows // -(-windows // count)  # as many, so that hardly any window is left over
     apart = np.zeros((n, count, p))
     apart[np.arange(n), np.arange(n) // window % count] = W
     return apart.reshape(n, -1), count * window
@@ -268,17 +270,18 @@ def _rows_before(valid: NDArray[np.bool_], every: int) -> NDArray[np.int64]:
 
 
 def _stretches(valid: NDArray[np.bool_], window: int, every: int) -> list[list[NDArray[np.int64]]]:
-    """Of every window the rows that count, in runs without a gap `every` rows apart."""
+    """Of every window the rows that count, in runs without a gap: one window for each row to begin with, in steps of
+    `every`. What parameters take from the noise is known in each of them, whatever the others have in common with it.
+    """
     found = []
     for first in range(0, len(valid) - window + 1, window):
-        runs = []
         for phase in range(every):
             index = np.arange(first + phase, first + window, every)
             counts = valid[index]
             edges = np.flatnonzero(np.diff(np.concatenate([[False], counts, [False]])))
-            runs += [index[start:end] for start, end in zip(edges[::2], edges[1::2], strict=True)]
-        if runs:
-            found.append(runs)
+            runs = [index[start:end] for start, end in zip(edges[::2], edges[1::2], strict=True)]
+            if runs:
+                found.append(runs)
     return found
 
 
@@ -288,7 +291,7 @@ def _usual_run(stretches: list[list[NDArray[np.int64]]]) -> int:
     return int(lengths[np.searchsorted(np.cumsum(lengths), lengths.sum() / 2)]) if len(lengths) else 0
 
 
-def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, every: int) -> _Sums | None:
+def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int) -> _Sums | None:
     """Of the windows that say something of noise of this order; None where there is none.
 
     Lower orders are found in them too: orders compare by the same rows only.
@@ -299,7 +302,7 @@ def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, ever
     for runs in stretches:
         # The quadratic form of the likelihood holds for runs of at least twice the order.
         runs = [run for run in runs if len(run) > 2 * order]
-        if sum(map(len, runs)) > (2 * q + order) * every and any(z[run, q].any() for run in runs):
+        if sum(map(len, runs)) > 2 * q + order and any(z[run, q].any() for run in runs):
             kept.append(runs)
     if not kept:
         return None
@@ -316,8 +319,8 @@ def _sums(z: Numbers, stretches: list[list[NDArray[np.int64]]], order: int, ever
     basis[:, :q, :q], missing = _orthonormal(gram)
     basis[:, q, q] = 1
     lagged, ends, owner = _of_runs(z, groups, basis, order)
-    freedom = np.array([sum(map(len, runs)) for runs in kept]) / every - q + missing.sum(axis=1)
-    return _Sums(lagged, ends, owner, missing, np.array([len(runs) for runs in kept], float) / every, freedom)
+    freedom = np.array([sum(map(len, runs)) for runs in kept]) - q + missing.sum(axis=1)
+    return _Sums(lagged, ends, owner, missing, np.array([len(runs) for runs in kept], float), freedom)
 
 
 def _of_runs(
