@@ -278,7 +278,7 @@ def whitener(pipeline: Pipeline) -> Whiten | None:
     """What makes white rows of any columns, where the noise's shape is to be estimated."""
     if not pipeline.whitens:
         return None
-    return lambda W, y, valid: whiten(pipeline, Rows(W, y, np.asarray(valid), np.empty(0)))
+    return lambda W, y, valid, beside=None: whiten(pipeline, Rows(W, y, np.asarray(valid), np.empty(0)), beside)
 
 
 def columns_by_joint(model: Model) -> list[tuple[int, slice] | None]:

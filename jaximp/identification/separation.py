@@ -69,8 +69,8 @@ class Separation(eqx.Module):
     """The human's parameters that the method cannot tell here, and why."""
 
 
-Whiten = Callable[[AnyArray, AnyArray, AnyArray], White]
-"""White rows of columns, torque and which of them count."""
+Whiten = Callable[..., White]
+"""White rows of columns, torque and which of them count, and where wanted further columns: `whiten`."""
 
 
 def fit_robot(alone: Regression, noise: Num[AnyArray, " L"] | None = None, white: White | None = None) -> WindowFit:
@@ -162,12 +162,14 @@ class _Slide:
     plain: Callable[..., SlidingFit]
     whiten: Whiten | None
 
-    def __call__(self, W: Array, y: Array, valid: Array) -> tuple[SlidingFit, White | None]:
-        """Estimates, with the condition number of the rows as they are."""
+    def __call__(
+        self, W: Array, y: Array, valid: Array, beside: Array | None = None
+    ) -> tuple[SlidingFit, White | None]:
+        """Estimates, with the condition number of the rows as they are. `beside` as in `whiten`."""
         ordinary = self.plain(W, y, valid=valid)
         if self.whiten is None:
             return ordinary, None
-        white = self.whiten(W, y, valid)
+        white = self.whiten(W, y, valid, beside)
         fit = self.plain(jnp.asarray(white.W), jnp.asarray(white.torque), valid=valid)
         if white.as_filtered is not None:
             return from_filtered(fit, ordinary, white), white
@@ -177,7 +179,7 @@ class _Slide:
 def _robot_first(robot: WindowFit, loaded: Regression, slide: _Slide) -> Separation:
     """Method 1. An error of the robot's parameters moves the human's by minus the fit of the robot's columns."""
     torque, n_human = loaded.torque - loaded.robot @ robot.theta, loaded.human.shape[1]
-    fit, white = slide(loaded.human, torque, loaded.valid)
+    fit, white = slide(loaded.human, torque, loaded.valid, loaded.robot)
     passed_on = _imitated(slide, white, loaded.human, loaded.robot, loaded.valid)
     inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
     fit = _with_inherited_variance(fit, inherited, robot.dof)

@@ -116,8 +116,12 @@ def rows_apart(pipeline: Pipeline) -> int:
     return max(1, round(pipeline.sample_rate / pipeline.filters.decimate / (2 * BEYOND * cutoff)))
 
 
-def whiten(pipeline: Pipeline, rows: Rows) -> White:
-    """White rows, by the noise of each output."""
+def whiten(pipeline: Pipeline, rows: Rows, beside: AnyArray | None = None) -> White:
+    """White rows, by the noise of each output.
+
+    **Arguments:** columns `beside` (N, *n, k) whose parameters came from elsewhere: what their errors leave of torque is
+    no noise.
+    """
     every, window = rows_apart(pipeline), pipeline.window_rows
     W, y, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
     outputs = 1 if y.ndim == 1 else y.shape[1]
@@ -131,9 +135,12 @@ def whiten(pipeline: Pipeline, rows: Rows) -> White:
 
     # [W, torque, noisy] are whitened twice: by what the filters do to white noise, then by what is left of the noise.
     p, noisy = W.shape[-1], [] if rows.noisy is None else [rows.noisy.reshape(W.shape)]
-    z = white(np.concatenate([W, y[..., None], *noisy], axis=-1), [filtered] * outputs)
-    noise = tuple(fit_window_noise(z[:, j, :p], z[:, j, p], valid[:, j], window, every) for j in range(outputs))
-    z = white(z, noise)
+    others = [] if beside is None else [np.reshape(beside, (*y.shape, -1))]
+    z = white(np.concatenate([W, y[..., None], *noisy, *others], axis=-1), [filtered] * outputs)
+    last = p + 1 + p * len(noisy)
+    explaining = np.concatenate([z[..., :p], z[..., last:]], axis=-1)
+    noise = tuple(fit_window_noise(explaining[:, j], z[:, j, p], valid[:, j], window, every) for j in range(outputs))
+    z = white(z[..., :last], noise)
     size = _sizes(z[..., :p], z[..., p], valid, window)
     z = z if outputs == 1 else z / size[:, None]
     W, y, shape = np.ascontiguousarray(z[..., :p]), np.ascontiguousarray(z[..., p]), rows.torque.shape

@@ -40,7 +40,7 @@ torque = {{ column = "torque_Nm", unit = "N m" }}
 
 [model]
 robot = {{ gear_ratio = 15, gravity = true, viscous = true, coulomb = true }}
-human = {{ gear_ratio = 15, offset = {offset} }}
+human = {{ gear_ratio = 15, offset = {offset}, joint_name = "other" }}  # a spring at the handle
 methods = [1, 3]
 
 [filter]

@@ -98,6 +98,8 @@ def times_outside(theta: Numbers, stderr: Numbers, ranges: Ranges, errors: float
 def question(theta: Numbers, ranges: Ranges) -> str:
     """What is probably wrong with inertia, damping and stiffness (3,) outside of these ranges: all that would explain
     it."""
+    if (theta <= 0).any():
+        return f"does the torque come late, or is a sign wrong ('{OTHER}' as joint_name for no human joint)?"
     asked = [text for factor, text in MISTAKES if _inside(theta * factor, ranges)]
     least, most = _ratios(theta, ranges, np.array([2, 2, 2]))
     if least <= most and least < GEARS[1] and most > GEARS[0]:

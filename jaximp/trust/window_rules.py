@@ -268,6 +268,8 @@ def _implausible(w: Windows, limits: TrustLimits) -> str:
     whose = "any human joint" if limits.one_joint_name is None else f"the {limits.one_joint_name}"
     low, high = ranges.bounds[k]
     size = f"{times:.3g} times too large" if times > 1 else f"{1 / times:.3g} times too small"
+    if value <= 0:
+        size = "not above zero, and too small"
     return (
         f"{plausibility.PARAMETERS[k]} is {value:.3g} {plausibility.UNITS[k]}, {size} for {whose} ({low:g} to {high:g})"
     )

@@ -137,7 +137,7 @@ def test_what_the_parameters_took_is_given_back() -> None:
 
 
 def test_what_parameters_took_is_not_counted_for_rows_that_neighbours_only_resemble() -> None:
-    """A robot's slow columns take a fifth of every window's rows: the white noise that is left must not pass for slow."""
+    """A robot's slow columns take a fifth of a window's rows: the white noise that is left must not pass for slow."""
     t = np.arange(500) / 25
     q = 0.7 * np.sin(2 * np.pi * 0.2 * t) + 0.3 * np.sin(2 * np.pi * 0.5 * t)
     dq = np.gradient(q, t)
