@@ -119,7 +119,7 @@ def rows_apart(pipeline: Pipeline) -> int:
 def whiten(pipeline: Pipeline, rows: Rows, beside: AnyArray | None = None) -> White:
     """White rows, by the noise of each output.
 
-    **Arguments:** columns `beside` (N, *n, k) whose parameters came from elsewhere: what their errors leave of torque is
+    **Arguments:** columns `beside` (N, *n, k) whose parameters came from elsewhere: what their errors leave is
     no noise.
     """
     every, window = rows_apart(pipeline), pipeline.window_rows
