@@ -274,13 +274,9 @@ class Chain(Model):
     ) -> Float[Array, "... p"]:
         """The base columns alone; shapes and errors as for every `Model`."""
         motion = self._checked(q, dq, ddq)
-
-        def lanes(chain: Chain, q: Array, dq: Array, ddq: Array) -> Array:
-            return _columns(chain, chain.tree, chain.base.kept, q, dq, ddq, jnp).swapaxes(0, 1)
-
         if self.n_joints > 1:
-            return rigid_body.over_samples(lanes, self.n_joints, self, *motion)
-        return rigid_body.over_samples(lanes, 1, self, *(x[..., None] for x in motion))[..., 0, :]
+            return rigid_body.over_samples(_lanes, self.n_joints, self, *motion)
+        return rigid_body.over_samples(_lanes, 1, self, *(x[..., None] for x in motion))[..., 0, :]
 
     def _require_tip(self) -> None:
         if self.tip is None:
@@ -317,21 +313,35 @@ class Chain(Model):
         bodies = [10 * k + list(PARAMETERS).index(name) for k in range(self.tree.n_bodies) for name in PREFERRED]
         names = [name for name, _, _ in self._standard()]
         rows = []
+        # Whatever its velocity, Stribeck's curve is a column of its own: here it is met by half of the motions.
+        curve = (np.median(np.abs(self.motors @ dq), axis=1), self.stribeck[1])
         for tree in (self.tree, _tidied(self.tree, rounding)):
-            W = _columns(self, tree, range(len(names)), q, dq, ddq, np)
+            W = _columns(self, tree, curve, range(len(names)), q, dq, ddq, np)
             W = W / np.maximum(np.linalg.norm(W, axis=(0, 2)), np.finfo(float).tiny)[:, None]
             rows.append(W.reshape(len(W), -1).T)
         return find_base(rows[0], names, [*bodies, *range(len(bodies), len(names))], rows[1])
 
 
+def _lanes(chain: Chain, q: Array, dq: Array, ddq: Array) -> Array:
+    """(n, p, N) of the base columns."""
+    return _columns(chain, chain.tree, chain.stribeck, chain.base.kept, q, dq, ddq, jnp).swapaxes(0, 1)
+
+
 def _columns(
-    chain: Chain, tree: KinematicTree, kept: Iterable[int], q: AnyArray, dq: AnyArray, ddq: AnyArray, xp: ModuleType
+    chain: Chain,
+    tree: KinematicTree,
+    curve: tuple[AnyArray, AnyArray],
+    kept: Iterable[int],
+    q: AnyArray,
+    dq: AnyArray,
+    ddq: AnyArray,
+    xp: ModuleType,
 ) -> AnyArray:
-    """(p, n, N) of the standard columns that are kept, for motions (n, N)."""
+    """(p, n, N) of the standard columns that are kept, for motions (n, N) and a Stribeck `curve`."""
     n, rigid = chain.n_joints, rigid_body.regressor_columns(tree, q, dq, ddq, xp)
     speed, change = chain.motors @ dq, chain.motors @ ddq
     sign = xp.sign(speed) if chain.width is None else xp.tanh(speed / chain.width[:, None])
-    at = Speed(speed, sign, (chain.stribeck[0][:, None], chain.stribeck[1][:, None]), xp)
+    at = Speed(speed, sign, (curve[0][:, None], curve[1][:, None]), xp)
     values = [change] * chain.rotor + [term.value(at) for term in chain.terms]
     # Column k of `motors`' transpose is what the torque of motor k does to the coordinates.
     groups = [(chain.motors, value) for value in values] + [(xp.eye(n), xp.ones_like(q))] * chain.offset

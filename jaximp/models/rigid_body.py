@@ -14,6 +14,7 @@ that), and rotations are nine arrays.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaximp.models.joint import sine_and_cosine
+from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray
 
 AT_ONCE = 256
@@ -97,12 +99,7 @@ def forward_kinematics(
     tree: KinematicTree, q: Num[ArrayLike, "... n"]
 ) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
     """Where the tip is: rotation from its frame to the base's `(..., 3, 3)`, and position `(..., 3)` [m]."""
-
-    def pose(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
-        R, p = _tip(tree, *_poses(tree, q))
-        return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(p)
-
-    return over_samples(pose, tree.n_joints, tree, q)
+    return over_samples(_pose_lanes, tree.n_joints, tree, q)
 
 
 def jacobian(tree: KinematicTree, q: Num[ArrayLike, "... n"]) -> Float[Array, "... 6 n"]:
@@ -110,18 +107,7 @@ def jacobian(tree: KinematicTree, q: Num[ArrayLike, "... n"]) -> Float[Array, ".
 
     In the base's frame: `jacobian(tree, q) @ dq`. Zero in the columns of joints that do not move the tip.
     """
-
-    def lanes(tree: KinematicTree, q: Array) -> Array:
-        if tree.tip_body < 0:
-            return jnp.zeros((6, *q.shape), q.dtype)
-        axes = _axes(tree, q, jnp)
-        R, _ = _poses(tree, q)
-        turn = [[R[a][b][tree.tip_body] for b in range(3)] for a in range(3)]
-        angular, linear = (tuple(x[tree.tip_body] for x in of) for of in axes)
-        linear = _plus(linear, _cross(angular, tuple(tree.tip_position)))
-        return jnp.stack([*_turned(turn, linear), *_turned(turn, angular)])
-
-    return over_samples(lanes, tree.n_joints, tree, q)
+    return over_samples(_jacobian_lanes, tree.n_joints, tree, q)
 
 
 def inverse_dynamics(
@@ -136,18 +122,7 @@ def inverse_dynamics(
     **Arguments:** `theta` ten parameters of each body about the origin of its frame, in the order of
     `spatial.PARAMETERS`; positions, velocities and accelerations.
     """
-
-    def lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array, ddq: Array) -> Array:
-        tree, theta = parts
-        axes, motion = _axes(tree, q, jnp), _motion(tree, q, dq, ddq, jnp)
-        o, b, a = motion
-        mass, moment, inertia = _split(theta[:, :, None])
-        force = _plus(_scaled(mass, a), _cross(b, moment), _cross(o, _cross(o, moment)))
-        couple = _plus(_cross(moment, a), _times(inertia, b), _cross(o, _times(inertia, o)))
-        force, couple = (tuple(x[:, None] for x in of) for of in (force, couple))
-        return (_dot(axes.linear, force) + _dot(axes.angular, couple)).sum(axis=0)
-
-    return over_samples(lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq, ddq)
+    return over_samples(_torque_lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq, ddq)
 
 
 def mass_matrix(
@@ -162,17 +137,7 @@ def coriolis_matrix(
 ) -> Float[Array, "... n n"]:
     """Matrix C(q, dq) of Christoffel's symbols: `C @ dq` is the torque of Coriolis and centrifugal forces, and
     `dM/dt - 2 C` is skew (Siciliano et al. 2009, *Robotics*, eqs. 7.44 to 7.49)."""
-
-    def lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array) -> Array:
-        def slope(direction: Array) -> Array:
-            return jax.jvp(lambda q: _mass_lanes(parts, q), (q,), (jnp.broadcast_to(direction[:, None], q.shape),))[1]
-
-        slopes = jax.vmap(slope)(jnp.eye(len(q), dtype=q.dtype))  # [k, i, j]: of M_ij along q_k
-        along = jnp.einsum("kijN,kN->ijN", slopes, dq)
-        across = jnp.einsum("jikN,kN->ijN", slopes, dq)
-        return (along + across - across.swapaxes(0, 1)) / 2
-
-    return over_samples(lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq)
+    return over_samples(_coriolis_lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq)
 
 
 def gravity_torque(
@@ -187,12 +152,7 @@ def regressor(
     tree: KinematicTree, q: Num[ArrayLike, "... n"], dq: Num[ArrayLike, "... n"], ddq: Num[ArrayLike, "... n"]
 ) -> Float[Array, "... n p"]:
     """Regressor of all `p = 10 n_b` inertial parameters, body after body: `regressor @ theta.ravel()` is the torque."""
-
-    def lanes(tree: KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:
-        columns = jnp.stack(regressor_columns(tree, q, dq, ddq), axis=1)
-        return columns.reshape(-1, *q.shape).swapaxes(0, 1)
-
-    return over_samples(lanes, tree.n_joints, tree, q, dq, ddq)
+    return over_samples(_regressor_lanes, tree.n_joints, tree, q, dq, ddq)
 
 
 def regressor_columns(
@@ -217,6 +177,50 @@ def regressor_columns(
 
     second = (square(0), product(0, 1), square(1), product(0, 2), product(1, 2), square(2))
     return (_dot(v, a), *moment, *second)
+
+
+# The same for motions (n, N) with the samples on the last axis, of what is returned as well.
+
+
+def _pose_lanes(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
+    R, p = _tip(tree, *_poses(tree, q))
+    return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(p)
+
+
+def _jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
+    if tree.tip_body < 0:
+        return jnp.zeros((6, *q.shape), q.dtype)
+    axes = _axes(tree, q, jnp)
+    R, _ = _poses(tree, q)
+    turn = [[R[a][b][tree.tip_body] for b in range(3)] for a in range(3)]
+    angular, linear = (tuple(x[tree.tip_body] for x in of) for of in axes)
+    linear = _plus(linear, _cross(angular, tuple(tree.tip_position)))
+    return jnp.stack([*_turned(turn, linear), *_turned(turn, angular)])
+
+
+def _torque_lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array, ddq: Array) -> Array:
+    tree, theta = parts
+    axes, (o, b, a) = _axes(tree, q, jnp), _motion(tree, q, dq, ddq, jnp)
+    mass, moment, inertia = _split(theta[:, :, None])
+    force = _plus(_scaled(mass, a), _cross(b, moment), _cross(o, _cross(o, moment)))
+    couple = _plus(_cross(moment, a), _times(inertia, b), _cross(o, _times(inertia, o)))
+    force, couple = (tuple(x[:, None] for x in of) for of in (force, couple))
+    return (_dot(axes.linear, force) + _dot(axes.angular, couple)).sum(axis=0)
+
+
+def _coriolis_lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array) -> Array:
+    def slope(direction: Array) -> Array:
+        return jax.jvp(lambda q: _mass_lanes(parts, q), (q,), (jnp.broadcast_to(direction[:, None], q.shape),))[1]
+
+    slopes = jax.vmap(slope)(jnp.eye(len(q), dtype=q.dtype))  # [k, i, j]: of M_ij along q_k
+    along = jnp.einsum("kijN,kN->ijN", slopes, dq)
+    across = jnp.einsum("jikN,kN->ijN", slopes, dq)
+    return (along + across - across.swapaxes(0, 1)) / 2
+
+
+def _regressor_lanes(tree: KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:
+    columns = jnp.stack(regressor_columns(tree, q, dq, ddq), axis=1)
+    return columns.reshape(-1, *q.shape).swapaxes(0, 1)
 
 
 def _mass_lanes(parts: tuple[KinematicTree, Array], q: Array) -> Array:
@@ -343,7 +347,8 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
     """A function of `parts` and motions (n, N), with the samples on the last axis of what it returns, for any batch
     (..., n).
 
-    Many samples are computed some at a time, so that what lies between stays in the cache.
+    Many samples are computed some at a time, so that what lies between stays in the cache. `lanes` must be a function of
+    a module: what is compiled for it is kept by it.
     """
     arrays = [jnp.asarray(x) for x in motion]
     shape, dtype = arrays[0].shape, jnp.result_type(*arrays, 1.0)
@@ -352,21 +357,24 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
             f"the motion has the shapes {', '.join(str(x.shape) for x in arrays)}: all must be equal, with the "
             f"{n} joints on the last axis"
         )
-    parts = jax.tree.map(lambda x: jnp.asarray(x, dtype), parts)
-    rows = [x.astype(dtype).reshape(-1, shape[-1]) for x in arrays]
-    count = len(rows[0])
-
-    def some(rows: Any) -> Any:
-        found = lanes(parts, *(x.T for x in rows))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
-
-    if count <= AT_ONCE:
-        found = some(rows)
-    else:
-        blocks = -(-count // AT_ONCE)
-        padded = [jnp.pad(x, ((0, blocks * AT_ONCE - count), (0, 0))).reshape(blocks, AT_ONCE, -1) for x in rows]
-        found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], jax.lax.map(some, padded))
+    rows = [x.astype(dtype).reshape(-1, n) for x in arrays]
+    found = _in_blocks(lanes, jax.tree.map(lambda x: jnp.asarray(x, dtype), parts), rows)
     return jax.tree.map(lambda x: x.reshape(*shape[:-1], *x.shape[1:]), found)
+
+
+@partial(compiled, static_argnums=0)
+def _in_blocks(lanes: Callable[..., Any], parts: Any, rows: list[Array]) -> Any:
+    """Of motions (N, n)."""
+
+    def some(rows: list[Array]) -> Any:
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes(parts, *(x.T for x in rows)))
+
+    count = len(rows[0])
+    if count <= AT_ONCE:
+        return some(rows)
+    blocks = -(-count // AT_ONCE)
+    padded = [jnp.pad(x, ((0, blocks * AT_ONCE - count), (0, 0))).reshape(blocks, AT_ONCE, -1) for x in rows]
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], jax.lax.map(some, padded))
 
 
 def _tip(tree: KinematicTree, R: Any, p: Vector) -> tuple[Any, Vector]:

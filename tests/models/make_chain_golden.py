@@ -64,8 +64,8 @@ def numbers(text: str, tip: str, joints: list[str], random: np.random.Generator)
                 "torque": pin.rnea(model, data, q, v, a)[place],
                 "gravity": pin.computeGeneralizedGravity(model, data, q)[place],
                 "mass": M[np.ix_(place, place)],
-                "rotation": pose.rotation,
-                "tip": pose.translation,
+                "rotation": pose.rotation.copy(),
+                "tip_position": pose.translation.copy(),
                 "jacobian": J[:, place],
                 "regressor": regressor[np.ix_(place, bodies)],
             }
