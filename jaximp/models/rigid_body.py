@@ -28,8 +28,8 @@ from jaximp.models.joint import sine_and_cosine
 from jaximp.numerics.compilation import compiled
 from jaximp.types import AnyArray
 
-AT_ONCE = 256
-"""Samples that are computed together: what a few hundred need stays in the cache."""
+AT_ONCE = 128
+"""Samples that are computed together: what so many need stays in the cache."""
 
 Vector = tuple[Any, Any, Any]
 """Components, each with the samples on its last axis."""
@@ -347,8 +347,8 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
     """A function of `parts` and motions (n, N), with the samples on the last axis of what it returns, for any batch
     (..., n).
 
-    Many samples are computed some at a time, so that what lies between stays in the cache. `lanes` must be a function of
-    a module: what is compiled for it is kept by it.
+    Many samples are computed some at a time, so that what lies between stays in the cache. `lanes` must be a function
+    of a module: what is compiled for it is kept by it.
     """
     arrays = [jnp.asarray(x) for x in motion]
     shape, dtype = arrays[0].shape, jnp.result_type(*arrays, 1.0)
@@ -357,14 +357,14 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
             f"the motion has the shapes {', '.join(str(x.shape) for x in arrays)}: all must be equal, with the "
             f"{n} joints on the last axis"
         )
-    rows = [x.astype(dtype).reshape(-1, n) for x in arrays]
-    found = _in_blocks(lanes, jax.tree.map(lambda x: jnp.asarray(x, dtype), parts), rows)
+    found = _in_blocks(lanes, parts, [x.astype(dtype).reshape(-1, n) for x in arrays])
     return jax.tree.map(lambda x: x.reshape(*shape[:-1], *x.shape[1:]), found)
 
 
 @partial(compiled, static_argnums=0)
 def _in_blocks(lanes: Callable[..., Any], parts: Any, rows: list[Array]) -> Any:
-    """Of motions (N, n)."""
+    """Of motions (N, n), in their precision."""
+    parts = jax.tree.map(lambda x: jnp.asarray(x, rows[0].dtype), parts)
 
     def some(rows: list[Array]) -> Any:
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes(parts, *(x.T for x in rows)))
@@ -372,9 +372,18 @@ def _in_blocks(lanes: Callable[..., Any], parts: Any, rows: list[Array]) -> Any:
     count = len(rows[0])
     if count <= AT_ONCE:
         return some(rows)
-    blocks = -(-count // AT_ONCE)
-    padded = [jnp.pad(x, ((0, blocks * AT_ONCE - count), (0, 0))).reshape(blocks, AT_ONCE, -1) for x in rows]
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], jax.lax.map(some, padded))
+
+    # Each block is written to its place; the last one goes back so far that it is full. (To fill up the samples, and to
+    # cut off what was too much, would copy everything once more.)
+    def into(whole: Any, start: Array) -> tuple[Any, None]:
+        block = some([jax.lax.dynamic_slice_in_dim(x, start, AT_ONCE) for x in rows])
+        write = partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
+        return jax.tree.map(write, whole, block), None
+
+    shapes = jax.eval_shape(some, [x[:1] for x in rows])
+    empty = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    starts = jnp.minimum(jnp.arange(0, count, AT_ONCE), count - AT_ONCE)
+    return jax.lax.scan(into, empty, starts)[0]
 
 
 def _tip(tree: KinematicTree, R: Any, p: Vector) -> tuple[Any, Vector]:
