@@ -349,8 +349,8 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
     """A function of `parts` and motions (n, N), with the samples on the last axis of what it returns, for any batch
     (..., n).
 
-    Very many samples are computed some at a time, so that what lies between stays in the cache. `lanes` must be a function
-    of a module: what is compiled for it is kept by it.
+    Very many samples are computed some at a time, so that what lies between stays in the cache. `lanes` must be a
+    function of a module: what is compiled for it is kept by it.
     """
     arrays = [jnp.asarray(x) for x in motion]
     shape, dtype = arrays[0].shape, jnp.result_type(*arrays, 1.0)
