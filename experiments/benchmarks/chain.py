@@ -191,7 +191,7 @@ def table(found: dict[str, Any]) -> str:
         lines.append(f"| {name} | {' | '.join(cells)} | {each['gradient ms']:.2f} ms{ratio} |")
     lines += ["", "Microseconds of one core for a sample, seconds for the first call (all samples, compilation in)."]
     if found["agreement"] is None:
-        return "\n".join([*lines, "", "pinocchio is not installed here: agreement was not measured.", ""])
+        return "\n".join([*lines, "", "Agreement with pinocchio was not measured here.", ""])
     worst = ", ".join(f"{what} {share:.1e}" for what, share in found["agreement"]["worst"].items())
     return "\n".join(
         [*lines, "", f"Largest difference from pinocchio over {found['agreement']['robots']} URDFs: {worst}.", ""]
@@ -208,8 +208,15 @@ def main() -> None:
         robots["Panda"] = (files["panda_description/panda"], fingers)
     found: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "jax": jax.__version__}
     found["robots"] = {name: measured(path, locked, bool(files)) for name, (path, locked) in robots.items()}
-    jax.config.update("jax_disable_most_optimizations", True)  # what runs once need not be fast
-    found["agreement"] = agreement(files) if files and "--quick" not in sys.argv else None
+    found["agreement"] = None
+    write(found)
+    if files and "--quick" not in sys.argv:
+        jax.config.update("jax_disable_most_optimizations", True)  # what runs once need not be fast
+        found["agreement"] = agreement(files)
+        write(found)
+
+
+def write(found: dict[str, Any]) -> None:
     (RESULTS / "chain.json").write_text(json.dumps(found, indent=2) + "\n")
     (RESULTS / "chain.md").write_text(table(found))
 

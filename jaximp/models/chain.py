@@ -21,7 +21,7 @@ from jaximp.models.friction import Speed, Term, friction_terms
 from jaximp.models.joint import parameter_units
 from jaximp.models.rigid_body import KinematicTree
 from jaximp.models.spatial import PARAMETERS
-from jaximp.models.urdf import Bodies, Frame, Urdf, following, moving_bodies, read_urdf, require_known
+from jaximp.models.urdf import Bodies, Frame, Joint, Urdf, following, moving_bodies, read_urdf, require_known
 from jaximp.types import AnyArray, Numbers
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -165,10 +165,7 @@ class Chain(Model):
         self.tree = _tree(robot, found, self.tip, joints, zeros, gravity)
         self.links = np.array([body.inertia for body in found.bodies])
         self._digest = _digest(self.tree, self.motors, *self.stribeck)
-        damping, dry = (drive.T**2 @ [j.damping for j in leaders], np.abs(drive.T) @ [j.friction for j in leaders])
-        shared = np.count_nonzero(drive) > len(names)  # friction of joints is not that of motors
-        known = {} if shared else {"viscous_friction": damping, "coulomb_friction": dry}
-        known |= {} if shared else {"coulomb_forward": dry, "coulomb_backward": dry}
+        known = _friction_at_motors(leaders, drive)
         own = [known.get(name, np.zeros(len(names))) for name, _, _ in self._groups()]
         self.standard_parameters = np.concatenate([self.links.ravel(), *own])
         self.base = self._base(joints, rounding)
@@ -388,6 +385,17 @@ def _drive(coupling: Any, ratio: Numbers) -> Numbers:
     if np.linalg.cond(matrix) > 1e9:
         raise ValueError("coupling is singular: every joint needs a motor of its own, or shares of several")
     return matrix / ratio
+
+
+def _friction_at_motors(joints: Sequence[Joint], drive: Numbers) -> dict[str, Numbers]:
+    """What the file gives its joints, as parameters of their motors; nothing where motors share joints."""
+    if np.count_nonzero(drive) > len(joints):
+        return {}
+    viscous = drive.T**2 @ [joint.damping for joint in joints]
+    dry = np.abs(drive.T) @ [joint.friction for joint in joints]
+    return {"viscous_friction": viscous} | dict.fromkeys(
+        ("coulomb_friction", "coulomb_forward", "coulomb_backward"), dry
+    )
 
 
 def _tip(robot: Urdf, found: Bodies, tip: str | None) -> str | None:
