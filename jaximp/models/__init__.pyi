@@ -1,3 +1,4 @@
+from . import rigid_body as rigid_body
 from .arm import ArmLinks as ArmLinks
 from .arm import PlanarArm as PlanarArm
 from .arm import coriolis_matrix as coriolis_matrix
@@ -10,6 +11,10 @@ from .base import Joints as Joints
 from .base import Model as Model
 from .base import Stacked as Stacked
 from .base import combine as combine
+from .base_parameters import BaseParameters as BaseParameters
+from .base_parameters import find_base as find_base
+from .chain import Chain as Chain
+from .chain import JointLimits as JointLimits
 from .endpoint import Ellipse as Ellipse
 from .endpoint import EndpointImpedance as EndpointImpedance
 from .endpoint import ellipse as ellipse
@@ -18,6 +23,7 @@ from .endpoint import endpoint_impedance as endpoint_impedance
 from .endpoint import endpoint_inertia as endpoint_inertia
 from .endpoint import endpoint_stiffness as endpoint_stiffness
 from .endpoint import propagated_stderr as propagated_stderr
+from .friction import FRICTION as FRICTION
 from .inertia import BASE_INERTIA as BASE_INERTIA
 from .inertia import BaseInertia as BaseInertia
 from .inertia import borner_from_lakatos as borner_from_lakatos
@@ -32,3 +38,8 @@ from .reflex import ReflexPathway as ReflexPathway
 from .reflex import pathway_of as pathway_of
 from .reflex import reflex_gain as reflex_gain
 from .reflex import with_gain as with_gain
+from .rigid_body import KinematicTree as KinematicTree
+from .urdf import SIX_JOINT_ARM as SIX_JOINT_ARM
+from .urdf import Urdf as Urdf
+from .urdf import parse_urdf as parse_urdf
+from .urdf import read_urdf as read_urdf

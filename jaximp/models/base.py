@@ -19,9 +19,10 @@ class Role(NamedTuple):
 
     kind: str
     """`inertia`, `base_inertia` (of an arm, in Lakatos's order), `damping`, `stiffness`, `friction`, `offset` (a
-    constant torque), or `other`."""
+    constant torque), or `other`; of a chain `link_mass`, `first_moment` and `link_inertia` (with what counts with
+    them, so that they may be negative), and `rotor_inertia`."""
     element: tuple[int, ...] = ()
-    """Which of several: the joint, or row and column of a matrix."""
+    """Which of several: the joint or link, or row and column of a matrix."""
 
 
 class Model(eqx.Module):
@@ -83,19 +84,23 @@ class Model(eqx.Module):
             raise ValueError(
                 "a model with a reflex needs the past of every sample: pass a whole recording to observation_matrix"
             )
+        q, dq, ddq = self._checked(q, dq, ddq)
+        function = self.row
+        for _ in range(q.ndim - (self.n_joints > 1)):
+            function = jax.vmap(function)
+        return function(q, dq, ddq)
+
+    def _checked(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, Array, Array]:
+        """Motions of one shape, with the joints on the last axis if there are several."""
         q, dq, ddq = jnp.asarray(q), jnp.asarray(dq), jnp.asarray(ddq)
         if not q.shape == dq.shape == ddq.shape:
             raise ValueError(
                 f"position {q.shape}, velocity {dq.shape} and acceleration {ddq.shape} differ in shape: pass one of "
                 "each for every sample"
             )
-        n_batch = q.ndim - (self.n_joints > 1)
         if self.n_joints > 1 and (q.ndim == 0 or q.shape[-1] != self.n_joints):
             raise ValueError(f"the model has {self.n_joints} joints, but the last axis of the position is {q.shape}")
-        function = self.row
-        for _ in range(n_batch):
-            function = jax.vmap(function)
-        return function(q, dq, ddq)
+        return q, dq, ddq
 
     def observation_matrix(
         self, q: Num[ArrayLike, "N *n"], dq: Num[ArrayLike, "N *n"], ddq: Num[ArrayLike, "N *n"]

@@ -12,7 +12,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from jaximp.models import MOTION, HumanJoint, Joints, Model, PlanarArm, RobotJoint, combine, parameter_units
+from factories.robots import planar
+from jaximp.models import (
+    MOTION,
+    Chain,
+    HumanJoint,
+    Joints,
+    Model,
+    PlanarArm,
+    RobotJoint,
+    combine,
+    parameter_units,
+    parse_urdf,
+)
 from jaximp.models.joint import sine_and_cosine
 
 Numbers = NDArray[np.float64]
@@ -101,6 +113,23 @@ def arm_robot(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers) -> Numbers:
     return eq13(b[:3], q, dq, ddq) + arm_weight(b[3:5], q, 1.62) + friction + b[9:11]
 
 
+def planar_chain(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers, length: float = 0.4, g: float = 9.81) -> Numbers:
+    """Lagrange's equations of two links in the vertical x-y plane, with the moments of each about its joint."""
+    (q1, q2), (v1, v2), (a1, a2) = (np.moveaxis(x, -1, 0) for x in (q, dq, ddq))
+    along, across = (b[3] * np.cos(q2) - b[4] * np.sin(q2)), (b[3] * np.sin(q2) + b[4] * np.cos(q2))
+    coupling = length * ((2 * a1 + a2) * along - (2 * v1 * v2 + v2**2) * across)
+    weight = g * (b[3] * np.cos(q1 + q2) - b[4] * np.sin(q1 + q2))
+    first = b[2] * a1 + b[5] * (a1 + a2) + coupling + g * (b[0] * np.cos(q1) - b[1] * np.sin(q1)) + weight
+    second = b[5] * (a1 + a2) + length * (a1 * along + v1**2 * across) + weight
+    return np.stack([first, second], axis=-1)
+
+
+def geared_chain(b: Numbers, q: Numbers, dq: Numbers, ddq: Numbers) -> Numbers:
+    """With a rotor (the first counts with the link), friction and a constant."""
+    rotor = b[6] * ddq * np.array([0.0, 1.0])
+    return planar_chain(b, q, dq, ddq) + rotor + b[7:9] * dq + b[9:11] * np.sign(dq) + b[11:13]
+
+
 def added(first: Torque, p: int, second: Torque) -> Torque:
     return lambda b, q, dq, ddq: first(b[:p], q, dq, ddq) + second(b[p:], q, dq, ddq)
 
@@ -116,6 +145,8 @@ class Case:
 ROBOT, HUMAN = RobotJoint(gear_ratio=15.0), HumanJoint(gear_ratio=15.0)
 ARM = PlanarArm(equilibrium=(0.08, 1.0))
 ARM_ROBOT = PlanarArm(impedance=False, gravity=True, viscous=True, coulomb=True, offset=True, g=1.62)
+CHAIN = Chain(parse_urdf(planar()), gravity=(0.0, -9.81, 0.0))
+GEARED_CHAIN = Chain(parse_urdf(planar()), gravity=(0.0, -9.81, 0.0), rotor=True, friction=True, offset=True)
 TWO_ROBOTS, TWO_HUMANS = Joints(ROBOT, ROBOT), Joints(HUMAN, HumanJoint(offset=False))
 CASES = [
     Case("robot", ROBOT, robot15, 5),
@@ -180,6 +211,14 @@ CASES = [
             + arm(np.r_[0.0, b[10:12], 0.0, b[12:14], 0.0, b[14:18]], q, dq, ddq)
         ),
         18,
+    ),
+    Case("chain", CHAIN, planar_chain, 6),
+    Case("chain with motors", GEARED_CHAIN, geared_chain, 13),
+    Case(
+        "chain + Joints",
+        CHAIN + TWO_HUMANS,
+        added(planar_chain, 6, side_by_side((human_offset, 4), (human_plain, 3))),
+        13,
     ),
 ]
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import jaximp
+from factories import robots
 from jaximp import models, signals
 from jaximp.design import objectives
 from jaximp.least_squares import chunks, sliding
@@ -45,6 +46,7 @@ WIDE = signals.design_differentiator(0.6)
 NOISE = np.array([1.0, 0.5, 0.2])
 ARM = models.ArmGeometry((0.3, 0.35))
 XI = np.array([0.3, 0.1, 0.12])
+CHAIN = models.Chain(models.parse_urdf(robots.planar()), friction="viscous")
 K, D = np.array([[30.0, 5.0], [5.0, 20.0]]), np.array([[2.0, 0.3], [0.1, 1.0]])
 ANGLES = np.array([[0.4, 1.1], [0.2, 0.9]])
 T = np.array([0.03, 0.21, 0.37])
@@ -153,6 +155,14 @@ CASES = [
         ANGLES,
         "the angles",
     ),
+    Case(
+        "models.Chain",
+        lambda x: CHAIN.observation_matrix(x, MOTION[:2, :2], MOTION[2:4, :2]),
+        ANGLES,
+        "the positions",
+    ),
+    Case("Chain.inverse_dynamics", lambda x: CHAIN.inverse_dynamics(x, ANGLES, ANGLES), ANGLES, "the positions"),
+    Case("Chain.mass_matrix, .jacobian", lambda x: (CHAIN.mass_matrix(x), CHAIN.jacobian(x)), ANGLES, "the positions"),
     Case("models.mass_matrix", lambda x: planar.mass_matrix(x, XI), ANGLES, "the angles"),
     Case("ArmGeometry.forward, .jacobian", lambda x: (ARM.forward(x), ARM.jacobian(x)), ANGLES, "the angles"),
     Case(
