@@ -126,7 +126,7 @@ def _pipeline(offset: bool, length: float, methods: tuple[int, ...] = (1,), mode
         model=HumanJoint(offset, GEAR_RATIO),
         robot=RobotJoint(GEAR_RATIO),
         methods=methods,
-        window=WindowSettings(length, step=0.02, min_velocity=0.1),
+        window=WindowSettings(length, step=0.02, min_velocity=0.1, noise="filtered"),  # ordinary, as in the paper
         filter=FilterSettings(
             position_cutoff=10.0,
             decimation_cutoff=5.0,
