@@ -20,3 +20,8 @@ from .rig import RigMotion as RigMotion
 from .rig import record as record
 from .rig import simulate_rig as simulate_rig
 from .rig_recordings import write_rig_recordings as write_rig_recordings
+from .robot import RobotDrive as RobotDrive
+from .robot import RobotRecording as RobotRecording
+from .robot import exciting_motion as exciting_motion
+from .robot import simulate_robot as simulate_robot
+from .robot import true_parameters as true_parameters
