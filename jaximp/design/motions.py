@@ -230,9 +230,11 @@ def _grams(
         t = jnp.arange(round(problem.samples)) / problem.encoder.sample_rate
         motion = measured_motion(problem.encoder, series, t)
     rows = regressor_rows(problem.model, motion, smooth, problem.period) * problem.scale
-    products = jnp.einsum("tni,tnj->tij", rows, rows) * (problem.samples / len(t))
+    share = problem.samples / len(t)
     if problem.window is None or whole:
-        return products.sum(axis=0)[None]
+        rows = rows.reshape(-1, rows.shape[-1])
+        return (share * (rows.T @ rows))[None]
+    products = share * jnp.einsum("tni,tnj->tij", rows, rows)
     length = max(1, round(problem.window * len(t)))
     return sliding_sums(products, length)[:: max(1, length // every) if every > 1 else 1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -337,3 +338,21 @@ def test_every_optimiser_finds_the_bottom_of_a_bowl(method: str) -> None:
 def test_same_seed_same_design() -> None:
     one, other = (design_excitation(HUMAN, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.trajectory.sine, other.trajectory.sine)
+
+
+@pytest.mark.parametrize("columns", [5, 20], ids=["written out", "left to LAPACK"])
+def test_objectives_of_few_and_of_many_columns_are_those_of_numpy(columns: int) -> None:
+    W = np.random.default_rng(0).normal(size=(60, columns)) * np.linspace(1, 3, columns)
+    gram, sigma = jnp.asarray(W.T @ W), np.linalg.svd(W, compute_uv=False)
+    expected = {
+        objectives.log_condition: np.log(sigma[0] / sigma[-1]),
+        objectives.log_sigma_min: -np.log(sigma[-1]),
+        objectives.log_volume: -np.log(sigma).mean(),
+        partial(objectives.log_stderr, parameter=2): 0.5 * np.log(np.linalg.inv(W.T @ W)[2, 2]),
+    }
+    for objective, value in expected.items():
+        np.testing.assert_allclose(objective(gram[None]), [value], rtol=1e-9)
+        slope = jax.grad(lambda x, of=objective: of(x[None])[0])(gram)
+        change = 1e-6 * np.eye(columns)
+        difference = (objective(gram[None] + change) - objective(gram[None] - change))[0] / 2
+        np.testing.assert_allclose((np.asarray(slope) * change).sum(), difference, rtol=1e-5)
