@@ -150,6 +150,55 @@ def driven(recorded: bool, drive: str | None) -> Fault:
     return fault
 
 
+def warming(random: np.random.Generator, of: Signals) -> Signals:
+    """The gain of the torque's sensor changes by 12 to 25 % while it warms up."""
+    gain, seconds = random.choice([-1, 1]) * random.uniform(0.12, 0.25), random.uniform(15, 60)
+    return of.spoilt(torque=of.torque * (1 + gain * (1 - np.exp(-of.time / seconds))))
+
+
+def pushed_and_pulled(random: np.random.Generator, of: Signals) -> Signals:
+    """The sensor counts one direction 10 to 25 % too small or too large."""
+    gain = random.choice([-1, 1]) * random.uniform(0.1, 0.25)
+    return of.spoilt(torque=of.torque * np.where(of.torque > 0, 1 + gain, 1))
+
+
+def lost_packets(random: np.random.Generator, of: Signals) -> Signals:
+    """8 to 20 % of the torque were lost, 40 to 120 ms at a time, and bridged by straight lines."""
+    share, length = random.uniform(0.08, 0.2), random.uniform(0.04, 0.12) * of.motion.rate
+    kept = np.ones(len(of.time), bool)
+    for first in random.integers(len(of.time), size=round(share * len(of.time) / length)):
+        kept[first : first + round(length)] = False
+    return of.spoilt(torque=np.interp(of.time, of.time[kept], of.torque[kept]))
+
+
+def slower_device(random: np.random.Generator, of: Signals) -> Signals:
+    """The torque was measured at 45 to 110 Hz, and joined by straight lines."""
+    stamps = np.arange(random.uniform(0, 0.01), of.time[-1], 1 / random.uniform(45, 110))
+    return of.spoilt(torque=np.interp(of.time, stamps, np.interp(stamps, of.time, of.torque)))
+
+
+def sent_twice(random: np.random.Generator, of: Signals) -> Signals:
+    """A buffer gives 6 to 15 % of the torque again in place of what came after it."""
+    length, torque = int(random.uniform(0.03, 0.15) * of.motion.rate), of.torque.copy()
+    count = round(random.uniform(0.06, 0.15) * len(torque) / length)
+    for block in random.choice(np.arange(1, len(torque) // length), count, replace=False):
+        torque[block * length : (block + 1) * length] = of.torque[(block - 1) * length : block * length]
+    return of.spoilt(torque=torque)
+
+
+def dead_zone(random: np.random.Generator, of: Signals) -> Signals:
+    """A robot's force sensor shows nothing below 0.05 to 0.25 standard deviations, and so much less above."""
+    width = random.uniform(0.05, 0.25) * of.torque.std()
+    return of.spoilt(torque=np.sign(of.torque) * np.maximum(np.abs(of.torque) - width, 0))
+
+
+def packets(random: np.random.Generator, of: Signals) -> Signals:
+    """Stamps of when packets of 6 to 16 ms arrived."""
+    count, rate = max(3, round(random.uniform(0.006, 0.016) * of.motion.rate)), of.motion.rate
+    index = np.arange(len(of.time))
+    return of.spoilt(time=index // count * count / rate + 1e-5 * (index % count))
+
+
 OWN = ("the joint is free", "own torque makes", "instrumental variables by", "belongs with later motion")
 FAULTS: Mapping[str, tuple[Fault, str | None, tuple[str, ...]]] = {
     "nothing": (good, None, ()),
@@ -182,6 +231,13 @@ FAULTS: Mapping[str, tuple[Fault, str | None, tuple[str, ...]]] = {
     "the same, with its command": (driven(True, None), None, OWN),
     'the same, `drive = "free"`, with its command': (driven(True, "free"), None, OWN),
     "nothing, with a reference that is followed": (followed, None, ()),
+    "a gain that changes": (warming, None, ("gain of a sensor",)),
+    "another gain in each direction": (pushed_and_pulled, None, ("torque sensor",)),
+    "lost packets, bridged by lines": (lost_packets, None, ("straight lines",)),
+    "a slower torque, joined by lines": (slower_device, None, ("straight lines",)),
+    "blocks of torque sent twice": (sent_twice, None, ("repeat earlier ones",)),
+    "a dead zone": (dead_zone, None, ("dead zone",)),
+    "stamps of packets": (packets, None, ("packets",)),
 }
 """What is done, the joint's name where it is given, and words that name the culprit."""
 

@@ -14,7 +14,7 @@ from jaximp.identification.whitening import White
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
 from jaximp.models.reflex import pathway_of
-from jaximp.trust.changes import Change, find_changes, levels
+from jaximp.trust.changes import Change, common_gain, find_changes, levels
 from jaximp.trust.frequencies import ByFrequency, estimate_by_frequency
 from jaximp.trust.score_tests import p_in_words
 from jaximp.types import Numbers
@@ -70,6 +70,23 @@ def changes(
         + f" {model.units[columns[k]]}, {p_in_words(one.p)}"
         for k, one in find_changes(value[:, columns], stderr[:, columns], dof).items()
     }
+
+
+def gain_in_words(model: Model, fit: SlidingFit, apart: int) -> str:
+    """How the gain of a sensor of one joint changes over the record; empty where it does not. Windows `apart` of each
+    other share no rows."""
+    columns = compared(model)
+    masses = [place for place, k in enumerate(columns) if model.roles[k].kind == "inertia"]
+    if model.n_joints > 1 or not masses or len(columns) < 3:
+        return ""
+    value, stderr, dof = (np.asarray(x)[::apart] for x in (fit.theta, fit.stderr, fit.dof))
+    found = common_gain(value[:, columns], stderr[:, columns], dof, masses[0])
+    if found is None:
+        return ""
+    return (
+        f"all parameters change by the same share, between {found.low:.0%} and {found.high:.0%} of their mean, inertia "
+        "too: the gain of a sensor changes"
+    )
 
 
 def _when(change: Change, value: Numbers, stderr: Numbers, start: Numbers, end: Numbers) -> str:

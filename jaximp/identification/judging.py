@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.identification.comparisons import by_frequency, changes
+from jaximp.identification.comparisons import by_frequency, changes, gain_in_words
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
@@ -76,6 +76,7 @@ def judge(
     judged = judged_names(model, limits)
     of_model = _OfModel.of(model, solved, misfits, place, judged, pipeline.ordinary, weights)
     of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
+    of_model = of_model.with_gain(gain_in_words(model, fit, _apart(place)), judged)
     of_model = of_model.with_doubts(doubts, judged)
     sure, fit = fit, _with_open_moves(fit, of_model.moves)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
@@ -320,6 +321,17 @@ class _OfModel:
         }
         moves = self.moves if doubts.moves is None else np.hypot(self.moves, doubts.moves)
         return replace(self, why=why, remedy=remedy, lacking=lacking, moves=moves)
+
+    def with_gain(self, changes: str, judged: Sequence[str]) -> _OfModel:
+        """With a sensor's gain that changes, in words; as they are where it does not."""
+        if not changes:
+            return self
+        return replace(
+            self,
+            why="; ".join(filter(None, [changes, self.why])),
+            remedy="; ".join(filter(None, ["calibrate the sensor before and after, or let it warm up", self.remedy])),
+            lacking={**self.lacking, **dict.fromkeys(judged, changes)},
+        )
 
 
 def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers) -> str:

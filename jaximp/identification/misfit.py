@@ -38,6 +38,8 @@ AT_ENDS = ("clock",)
 LEAVES = 0.1
 """A group that explains what is found leaves another one such a share of its own evidence at most: those that are
 right left 6 %, those that only looked like it 10 to 170 %, in simulated records of 60 s."""
+USUAL = (0.05, 0.95)
+"""Quantiles of the torque between which a sensor's scale is compared."""
 HIDES = {"lag": "stiffness"}
 """Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
 
@@ -70,7 +72,18 @@ def find_misfits(
     suspects = [*of_one_joint(pipeline, recording, whole), *([] if own is None else [(DRIVE, own)])]
     groups = ((name, {0: columns}) for name, columns in suspects)
     tests = Tests.of(pipeline, white, rows.valid, groups)
-    return _of_joint(pipeline, _with_left(tests, tests()), theta, _half(pipeline, recording))
+    explained = np.reshape(rows.W, (len(counts), -1))[counts] @ whole
+    tested = [_with_ambiguity(one, explained) for one in _with_left(tests, tests())]
+    return _of_joint(pipeline, tested, theta, _half(pipeline, recording))
+
+
+def _with_ambiguity(misfit: Misfit, torque: Numbers) -> Misfit:
+    """Of a sensor, by the spread of its local scale over the model's torque, but for its rarest values."""
+    if untagged(misfit.group)[0] != "sensor":
+        return misfit
+    low, high = np.quantile(torque, USUAL)
+    T = np.linspace(low, high, 21)
+    return replace(misfit, ambiguity=float(np.ptp(1 + 2 * misfit.weights[0] * T + 3 * misfit.weights[1] * T**2)))
 
 
 def _half(pipeline: Pipeline, recording: Recording) -> float:
@@ -331,6 +344,8 @@ def off_by(
     found: dict[str, float] = {}
     suspected = _suspected(misfits)
     for one in suspected:
+        if one.ambiguity > 2 * SHARE:
+            return dict.fromkeys(names, np.nan)
         for k, name in enumerate(names):
             share, error = (x[k] / size[k] if size[k] > 0 else 0.0 for x in (one.move, ERRORS * one.stderr))
             if abs(share) > max(error, SHARE):

@@ -176,11 +176,11 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
     clean, moving = measured.clean[::decimate], speed >= pipeline.window.min_velocity
     valid = clean & moving if recording.n_joints == 1 else clean[:, None] & moving
     if not valid.any():
-        cut = "" if recording.clipped is None else f", {recording.clipped.mean():.0%} lie at a limit of the torque"
+        found_before = "".join(f"; {fault.text}" for fault in recording.faults)
         raise ValueError(
-            f"no sample is left after filtering ({np.mean(~recording.valid):.0%} cannot be used{cut}): the recording "
-            "is too short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
-            "window.min_velocity"
+            f"no sample is left after filtering ({np.mean(~recording.valid):.0%} cannot be used): the recording is too "
+            "short for the filters (and the lags of a reflex), has too many gaps, or never moves faster than "
+            f"window.min_velocity{found_before}"
         )
     noisy, level = _noise_of(measured, found, k)
     return Rows(W, y, valid, recording.time[::decimate], noisy), level

@@ -13,6 +13,8 @@ from jaximp.recordings.errors import RecordingError
 
 JITTER = 0.01
 """Stamps that differ from a uniform grid by less than this share of an interval are taken as even."""
+PACKET, OFTEN = 5.0, 0.02
+"""Stamps come in packets if so large a share of the intervals is so many times the usual one, and most of the time."""
 GAP = 1.5
 """An interval longer than this many median intervals is a gap."""
 LARGEST_GROWTH = 50
@@ -63,6 +65,7 @@ def on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], v
         growth = (stamps[-1] - stamps[0]) / median / len(stamps)
     if not 1e-9 < median < 1e6:
         raise RecordingError(f"the median interval of {median:.3g} s is no sampling interval; correct the unit of time")
+    _refuse_packets(intervals, median)
     longest = int(np.argmax(intervals))
     if not growth <= LARGEST_GROWTH or growth * len(stamps) > MOST_GRID:
         raise RecordingError(
@@ -78,6 +81,18 @@ def on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], v
         hint = "" if intervals[longest] > 2.5 * median else " (if stamps are only rounded, give 'sample_rate' instead)"
         notes.append(f"{what} ({where}): the samples inside are masked{hint}")
     return time, samples, valid, notes
+
+
+def _refuse_packets(intervals: NDArray[np.float64], median: float) -> None:
+    """Refuse stamps of when samples arrived, and not of when they were measured."""
+    waits = intervals > PACKET * median
+    if waits.mean() > OFTEN and intervals[waits].sum() > 0.5 * intervals.sum():
+        wait, rate = float(np.median(intervals[waits])), len(intervals) / intervals.sum()
+        raise RecordingError(
+            f"the time stamps come in packets ({1 / waits.mean():.2g} samples at once, then nothing for "
+            f"{1e3 * wait:.3g} ms): they say when samples arrived, not when they were measured; give sample_rate = "
+            f"{rate:.4g} (or the rate that was set) in place of time"
+        )
 
 
 def _is_even(stamps: NDArray[np.float64]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from jaximp.types import Fault, Numbers, listed
 
 MEASURED = ("position", "torque", "velocity", "acceleration", "force")
 """Channels that a sensor measured; a reference and a command may leap."""
+ROUGH = ("torque", "force")
+"""Channels with noise, which neither lies on lines nor repeats itself; a position is smooth, and does."""
 SPLINE = 5
 """Degree of what is laid through the measured samples of a signal that was held between them."""
 
@@ -45,30 +48,59 @@ def judge_raw(stamps: Numbers, given: Mapping[str, Signal], valid: NDArray[np.bo
         values = np.where(valid[:, None], given[channel].values, np.nan)
         for k, x in enumerate(values.T):
             label = channel if values.shape[1] == 1 else f"{channel} {k + 1}"
-            updates = signals.held_updates(x)
-            known = x if updates is None else x[updates]
-            level = signals.noise_level(known)
-            noise.setdefault(channel, []).append(level)
-            wrong = signals.glitches(known, level) | signals.dropouts(known, level)
-            if updates is None:
-                spoilt = wrong
-            else:
-                spoilt = _until_next(updates, wrong, len(x))
-                values[:, k] = _between(stamps, x, updates[~wrong])
-                faults.append(_held(label, updates, len(x)))
-            if spoilt.any():
-                faults.append(_glitches(label, spoilt, stamps))
-            kept &= ~spoilt & np.isfinite(values[:, k])
+            one = _judge_samples(label, channel, x, stamps)
+            noise.setdefault(channel, []).append(one.noise)
+            faults += one.faults
+            kept &= ~one.spoilt & np.isfinite(one.values)
+            values[:, k] = one.values
         found[channel] = replace(given[channel], values=values)
     clipped = np.zeros(len(valid), bool)
     positions = np.where(kept[:, None], found["position"].values, np.nan)
     rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
     for k, x in enumerate(found["torque"].values.T):
         limits = signals.torque_limits(np.where(kept, x, np.nan), positions, rate, noise["torque"][k])
+        label = "torque" if len(noise["torque"]) == 1 else f"torque {k + 1}"
         if limits:
-            faults.append(_limits("torque" if len(noise["torque"]) == 1 else f"torque {k + 1}", limits))
+            faults.append(_limits(label, limits))
             clipped |= np.any([one.at for one in limits], axis=0)
+        value = signals.crowded_value(np.where(kept, x, np.nan))
+        if value is not None:
+            faults.append(_dead_zone(label, value, float(np.mean(x == value))))
+            clipped |= x == value
     return Judged(found, kept & ~clipped, clipped, np.array(noise["position"]), tuple(faults))
+
+
+class _Samples(NamedTuple):
+    """Those of one signal."""
+
+    values: Numbers
+    """(N,) with a smooth curve in place of what a recorder made of a slower signal."""
+    spoilt: NDArray[np.bool_]
+    noise: float
+    faults: list[Fault]
+
+
+def _judge_samples(label: str, channel: str, x: Numbers, stamps: Numbers) -> _Samples:
+    updates = signals.held_updates(x)
+    slower = signals.corners(x) if updates is None and channel in ROUGH else None
+    if slower is not None:
+        places, values = slower
+        at = np.interp(places, np.arange(len(stamps)), stamps)
+        curve, nothing = _through(at, values, stamps, np.isnan(x)), np.zeros(len(x), bool)
+        return _Samples(curve, nothing, signals.noise_level(values), [_joined(label, places, len(x))])
+    known = x if updates is None else x[updates]
+    level = signals.noise_level(known)
+    wrong = signals.glitches(known, level) | signals.dropouts(known, level)
+    if updates is None:
+        traces = _traces(label, channel, x)
+        spoilt, faults = np.any([wrong, *(at for _, at in traces)], axis=0), [fault for fault, _ in traces]
+    else:
+        wrong, measured = _until_next(updates, wrong, len(x)), updates[~wrong & np.isfinite(known)]
+        x = _through(stamps[measured], x[measured], stamps, np.isnan(x))
+        spoilt, faults = wrong, [_held(label, updates, len(x))]
+    if wrong.any():
+        faults.append(_glitches(label, wrong, stamps))
+    return _Samples(x, spoilt, level, faults)
 
 
 def _until_next(updates: NDArray[np.int64], wrong: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
@@ -80,14 +112,27 @@ def _until_next(updates: NDArray[np.int64], wrong: NDArray[np.bool_], count: int
     return out
 
 
-def _between(stamps: Numbers, x: Numbers, updates: NDArray[np.int64]) -> Numbers:
-    """(N,) a smooth curve through the samples that were measured; nothing where it would run on beyond them."""
+def _traces(label: str, channel: str, x: Numbers) -> list[tuple[Fault, NDArray[np.bool_]]]:
+    """What a recorder did to samples that no noise does, and (N,) where."""
+    if channel not in ROUGH:
+        return []
+    kinds = [
+        ("lines", signals.bridged(x), "lie on straight lines to the last digit, as if drawn over lost samples"),
+        ("repeated", signals.repeated(x), "repeat earlier ones to the last digit, as of a buffer sent twice"),
+    ]
+    return [
+        (Fault(label, kind, float(at.mean()), f"{label}: {at.mean():.1%} of the samples {what}: masked"), at)
+        for kind, at, what in kinds
+        if at.any()
+    ]
+
+
+def _through(at: Numbers, values: Numbers, stamps: Numbers, missing: NDArray[np.bool_]) -> Numbers:
+    """(N,) a smooth curve through what was measured; nothing where it would run on beyond that."""
     from scipy.interpolate import make_interp_spline
 
-    known = updates[np.isfinite(x[updates])]
-    curve = np.asarray(make_interp_spline(stamps[known], x[known], k=SPLINE)(stamps))
-    outside = (stamps < stamps[known[0]]) | (stamps > stamps[known[-1]])
-    return np.where(np.isnan(x) | outside, np.nan, curve)
+    curve = np.asarray(make_interp_spline(at, values, k=SPLINE)(stamps))
+    return np.where(missing | (stamps < at[0]) | (stamps > at[-1]), np.nan, curve)
 
 
 def _glitches(label: str, wrong: NDArray[np.bool_], stamps: Numbers) -> Fault:
@@ -106,6 +151,19 @@ def _held(label: str, updates: NDArray[np.int64], count: int) -> Fault:
         "laid through the first sample of each value"
     )
     return Fault(label, "held samples", 1 - len(updates) / count, f"{label}: {text}")
+
+
+def _joined(label: str, places: Numbers, count: int) -> Fault:
+    text = (
+        f"is a slower signal whose samples, one in {np.median(np.diff(places)):.3g}, were joined by straight lines: a "
+        "smooth curve is laid through them"
+    )
+    return Fault(label, "joined samples", 1 - len(places) / count, f"{label}: {text}")
+
+
+def _dead_zone(label: str, value: float, share: float) -> Fault:
+    text = f"{share:.1%} of the samples are exactly {value:.4g}, as of a sensor with a dead zone: masked"
+    return Fault(label, "dead zone", share, f"{label}: {text}")
 
 
 def _limits(label: str, limits: tuple[signals.Limit, ...]) -> Fault:

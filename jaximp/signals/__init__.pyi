@@ -10,9 +10,13 @@ from .derivatives import savitzky_golay_gain as savitzky_golay_gain
 from .derivatives import savitzky_golay_half_length as savitzky_golay_half_length
 from .faults import STANDS_OUT as STANDS_OUT
 from .faults import Limit as Limit
+from .faults import bridged as bridged
+from .faults import corners as corners
+from .faults import crowded_value as crowded_value
 from .faults import dropouts as dropouts
 from .faults import glitches as glitches
 from .faults import held_updates as held_updates
+from .faults import repeated as repeated
 from .faults import torque_limits as torque_limits
 from .filters import CutSignal as CutSignal
 from .filters import PaddedFilter as PaddedFilter

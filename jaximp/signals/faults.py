@@ -30,6 +30,22 @@ EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
 FEWEST_UPDATES, LONGEST_HELD = 20, 64
 """Of a signal that is held between its samples, and for how many samples."""
+ROUNDED = 1e-9
+"""Share of a signal's range that a number in a file is rounded by, if nothing coarser is seen."""
+NOISY = 100.0
+"""Fourth differences of a signal are so many of its steps, or an exact line or a repeated block may be there by
+chance."""
+ROUGHEST = 0.98
+"""Of samples by which a signal's roughness is told: where a slower one was joined by lines, only corners are rough."""
+FEW_DIGITS, MOST_DECIMALS = 500, 9
+"""Samples by which the number of decimals is told, and how many are looked for."""
+LINE, MOSTLY = 8, 0.4
+"""Samples on a straight line to the last digit that no noise makes, and the share of all that lie on lines where a
+recorder laid them through a slower signal."""
+BLOCK = 8
+"""Samples that noise does not repeat to the last digit."""
+CROWDED_VALUE = 0.01
+"""Share of a noisy signal's samples that one value may have."""
 MOTION_CUTOFF = 20.0
 """Of the motion that the torque at a limit is predicted from [Hz]."""
 
@@ -229,6 +245,96 @@ def dropouts(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
         if away > max(np.ptp(others), STANDS_OUT * level):
             out[known[at]] = True
     return out
+
+
+def _rounded_by(x: Numbers) -> float | None:
+    """By how much the samples of a signal (N,) are rounded; None where it is not rougher than that by far, so that
+    chance makes lines and repetitions."""
+    known = x[np.isfinite(x)]
+    if len(known) < 2 * LONGEST_HELD:
+        return None
+    rounded = max(quantisation_step(x), _last_digit(known), ROUNDED * float(np.ptp(known)))
+    rough = np.abs(np.diff(x, 4))  # a smooth signal bends, but not so fast
+    rough = rough[np.isfinite(rough)]
+    return rounded if len(rough) and np.quantile(rough, ROUGHEST) > NOISY * rounded else None
+
+
+def _last_digit(x: Numbers) -> float:
+    """That of numbers written with so many decimals, or zero."""
+    some = x[:: max(1, len(x) // FEW_DIGITS)]
+    for decimals in range(MOST_DECIMALS):
+        scaled = some * 10.0**decimals
+        if (np.abs(scaled - np.rint(scaled)) < 1e-6 * np.maximum(1, np.abs(scaled) * 1e-6)).all():
+            return 10.0**-decimals
+    return 0.0
+
+
+def _on_lines(x: Numbers, rounded: float) -> list[tuple[int, int]]:
+    """First and last samples of straight stretches that are not level."""
+    slope = np.diff(x)
+    straight = (np.abs(np.diff(slope)) <= 2 * rounded) & (np.abs(slope[1:]) > 3 * rounded)
+    edges = np.flatnonzero(np.diff(np.r_[False, straight, False].astype(np.int8)))
+    return [(int(a), int(b) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def bridged(x: Numbers) -> NDArray[np.bool_]:
+    """Samples of a noisy signal (N,) that lie on straight lines to the last digit: a recorder lost them and drew a line
+    to the next one that it had."""
+    out, rounded = np.zeros(len(x), bool), _rounded_by(x)
+    for first, last in [] if rounded is None else _on_lines(x, rounded):
+        if last - first >= LINE:
+            out[first + 1 : last] = True
+    return out
+
+
+def corners(x: Numbers) -> tuple[Numbers, Numbers] | None:
+    """Where lines meet that a recorder laid through the samples of a slower signal: places, in samples, and values;
+    None where a signal (N,) is not made of such lines."""
+    rounded = _rounded_by(x)
+    lines = [] if rounded is None else _on_lines(x, rounded)
+    if sum(last - first for first, last in lines) < MOSTLY * len(x) or len(lines) < FEWEST_UPDATES:
+        return None
+    first, last = np.array(lines).T
+    slope = (x[last] - x[first]) / (last - first)
+    level = x[first] - slope * first
+    apart = np.diff(slope)
+    places = -np.diff(level) / np.where(apart == 0, np.inf, apart)
+    meet = (apart != 0) & (first[1:] - last[:-1] < 2) & (places >= last[:-1] - 1) & (places <= first[1:] + 1)
+    if meet.sum() < FEWEST_UPDATES:
+        return None
+    places, values = places[meet], (level[:-1] + slope[:-1] * places)[meet]
+    ahead = np.r_[True, np.diff(places) > 0.5]
+    return places[ahead], values[ahead]
+
+
+def repeated(x: Numbers) -> NDArray[np.bool_]:
+    """Samples of a noisy signal (N,) that were there before, block by block: a buffer that was sent twice. None where
+    most of it is, as of a signal that was made periodic."""
+    out = np.zeros(len(x), bool)
+    if _rounded_by(x) is None:
+        return out
+    bits = np.ascontiguousarray(x, float).view(np.uint64)
+    blocks = np.lib.stride_tricks.sliding_window_view(bits, BLOCK)
+    odd = np.random.default_rng(0).integers(1 << 62, size=BLOCK, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    _, first, which = np.unique((blocks * odd).sum(axis=1), return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[which] != np.arange(len(which)))
+    block = again[:, None] + np.arange(BLOCK)
+    alike = (x[block] == x[first[which[again], None] + np.arange(BLOCK)]).all(axis=1)
+    varied = (np.diff(x[block], axis=1) != 0).sum(axis=1) >= BLOCK - 2  # no dead zone, nor a limit
+    out[block[alike & varied]] = True
+    return out if out.mean() < MOSTLY else np.zeros_like(out)
+
+
+def crowded_value(x: Numbers) -> float | None:
+    """The value that a noisy signal (N,) keeps coming back to, such as that of a dead zone; None where it does not."""
+    if _rounded_by(x) is None:
+        return None
+    values, counts = np.unique(x[np.isfinite(x)], return_counts=True)
+    most = float(values[counts.argmax()])
+    at = x == most
+    visits = int((np.diff(np.r_[False, at].astype(np.int8)) > 0).sum())
+    inside = values[0] < most < values[-1]
+    return most if inside and at.mean() > CROWDED_VALUE and visits >= FEWEST_VISITS else None
 
 
 def held_updates(x: Numbers) -> NDArray[np.int64] | None:

@@ -14,6 +14,9 @@ MOST_LEVELS, MOST_COMPARED = 4, 200
 """Levels that a summary names, and windows among which they are sought."""
 FEWEST = 3
 """Windows that are compared."""
+BLOCKS, SELDOM, AGREE = 6, 0.003, 3.0
+"""Stretches of a record between which a gain is compared, with what probability a constant mass seems to change, and
+how well all parameters must agree on a common factor, by chi-squared per degree of freedom."""
 
 
 class Change(NamedTuple):
@@ -69,6 +72,30 @@ def find_changes(value: Numbers, stderr: Numbers, dof: Numbers) -> dict[int, Cha
     value, stderr, dof = value[known], stderr[known], dof[known]
     found = {k: same_in_all(value[:, k], stderr[:, k], dof) for k in range(value.shape[1])}
     return {k: one for k, one in found.items() if one.p < FAMILYWISE / len(found) and one.matters}
+
+
+def common_gain(value: Numbers, stderr: Numbers, dof: Numbers, mass: int) -> Change | None:
+    """By what factor all parameters change together, as where the gain of a sensor changes; None where they do not.
+
+    A mass does not change by itself. Where it does, and all others by the same share, it is the sensor.
+
+    **Arguments:** estimates and errors (K, p) of windows that share no rows, in the order of time, and degrees of
+    freedom (K,); `mass`, the column of a mass or an inertia.
+    """
+    known = np.isfinite(value).all(axis=1) & (stderr > 0).all(axis=1) & (dof > 0)
+    if known.sum() < BLOCKS * FEWEST:
+        return None
+    parts = np.array_split(np.flatnonzero(known), BLOCKS)
+    weight = np.array([(1 / stderr[part] ** 2).sum(axis=0) for part in parts])
+    mean = np.array([(value[part] / stderr[part] ** 2).sum(axis=0) for part in parts]) / weight
+    whole = (mean * weight).sum(axis=0) / weight.sum(axis=0)
+    sure = weight * whole**2
+    gain, error = (sure * mean / whole).sum(axis=1) / sure.sum(axis=1), 1 / np.sqrt(sure.sum(axis=1))
+    left = (weight * (mean - gain[:, None] * whole) ** 2).sum() / ((BLOCKS - 1) * (value.shape[1] - 1))
+    many = np.full(BLOCKS, np.inf)
+    of_mass = same_in_all(mean[:, mass], 1 / np.sqrt(weight[:, mass]), many)
+    together = same_in_all(gain, error, many)
+    return together if of_mass.p < SELDOM and left < AGREE and together.high - together.low > SHARE else None
 
 
 class Level(NamedTuple):

@@ -53,6 +53,8 @@ class Misfit:
     """(g,)"""
     left: float = 0.0
     """Most evidence of another group that is significant with this one in the model; zero where this explains all."""
+    ambiguity: float = 0.0
+    """By what share parameters differ between torques at which a sensor's scale might be right: nothing tells which."""
 
 
 class _Sums(NamedTuple):

@@ -301,7 +301,7 @@ MOTION: tuple[Rule[Windows], ...] = (
         NO_DATA,
         # What is left of a torque that was cut off is no fair sample of it.
         lambda w, limits: np.broadcast_to(w.at_limit > limits.max_at_limit, np.shape(w.samples)),
-        lambda w, limits: f"the torque is cut off at a limit in {w.at_limit:.1%} of the samples",
+        lambda w, limits: f"the torque is cut off, or stays at one value, in {w.at_limit:.1%} of the samples",
         lambda w, limits: "use a larger range of the sensor or the motor, or move less",
     ),
     Rule(

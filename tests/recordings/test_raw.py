@@ -109,3 +109,53 @@ def test_the_step_of_an_encoder_is_seen_before_uneven_samples_are_resampled() ->
     assert "uneven" in recording.notes[0]
     assert recording.position_noise is not None
     np.testing.assert_allclose(recording.position_noise, step / np.sqrt(12), rtol=0.02)
+
+
+def torque_with(name: str) -> Numbers:
+    """That of `joint` with what recorders do to samples that were not there in time, or were too small."""
+    random, torque = np.random.default_rng(3), joint()[1]
+    if name == "bridged":
+        kept = np.ones(len(torque), bool)
+        for first in random.integers(100, len(torque) - 100, 25):
+            kept[first : first + 30] = False
+        return np.interp(TIME, TIME[kept], torque[kept])
+    if name == "slower":
+        slow = np.arange(0, TIME[-1], 1 / 83.0)
+        return np.interp(TIME, slow, np.interp(slow, TIME, torque))
+    if name == "sent twice":
+        for first in random.integers(1000, len(torque) - 200, 12):
+            torque[first : first + 40] = torque[first - 200 : first - 160]
+        return torque
+    away = torque - np.median(torque)
+    return np.sign(away) * np.maximum(np.abs(away) - 0.3, 0)
+
+
+@pytest.mark.parametrize("decimals", [None, 4], ids=["all digits", "four decimals"])
+@pytest.mark.parametrize(
+    ("name", "kind", "share"),
+    [("bridged", "lines", 0.07), ("sent twice", "repeated", 0.045), ("dead zone", "dead zone", 0.07)],
+)
+def test_what_a_recorder_made_of_the_torque_is_masked(name: str, kind: str, share: float, decimals: int | None) -> None:
+    position, torque = joint()[0], torque_with(name)
+    recording = recording_from_arrays(TIME, position, torque if decimals is None else np.round(torque, decimals))
+    assert list(kinds(recording)) == [f"torque: {kind}"]
+    assert (~recording.valid).mean() == pytest.approx(share, rel=0.25)
+
+
+@pytest.mark.parametrize("decimals", [None, 4], ids=["all digits", "four decimals"])
+def test_a_slower_torque_that_was_joined_by_lines_is_a_smooth_curve_again(decimals: int | None) -> None:
+    (position, _), torque = joint(), torque_with("slower")
+    recording = recording_from_arrays(TIME, position, torque if decimals is None else np.round(torque, decimals))
+    assert list(kinds(recording)) == ["torque: joined samples"]
+    assert "one in 6.02, were joined by straight lines" in kinds(recording)["torque: joined samples"]
+    assert recording.valid.mean() > 0.99
+    apart = (recording.torque[:, 0] - torque)[recording.valid]
+    assert 0 < np.abs(apart).max() < 0.5
+
+
+def test_signals_without_noise_may_lie_on_lines_and_repeat_themselves() -> None:
+    position = joint()[0]
+    triangle = 3 * np.abs((TIME * 0.7) % 2 - 1) - 1
+    periodic = np.tile((25 * np.sin(5.65 * TIME) + 3 * np.sin(11.3 * TIME))[:500], len(TIME) // 500)
+    for torque in (triangle, periodic):
+        assert recording_from_arrays(TIME, position, torque).valid.all()

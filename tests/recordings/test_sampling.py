@@ -63,6 +63,14 @@ def test_stamps_rounded_until_they_repeat_point_to_the_sample_rate() -> None:
     assert "give 'sample_rate' instead" in str(caught.value)
 
 
+def test_stamps_of_when_packets_arrived_point_to_the_sample_rate() -> None:
+    count = 3000
+    arrived = np.repeat(np.arange(0, count, 12), 12)[:count] / 1000 + 1e-5 * (np.arange(count) % 12)
+    q = np.sin(np.arange(count) / 100)
+    with pytest.raises(ValueError, match=r"come in packets \(12 samples at once, .* give sample_rate = 100\d"):
+        recording_from_arrays(arrived, q, -q)
+
+
 def test_small_jitter_is_not_interpolated() -> None:
     k = np.arange(1000)
     t = 0.005 * k + np.random.default_rng(0).uniform(-4e-5, 4e-5, 1000)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from statsmodels.stats.oneway import anova_oneway
 
-from jaximp.trust.changes import find_changes, levels, same_in_all
+from jaximp.trust.changes import common_gain, find_changes, levels, same_in_all
 from jaximp.trust.score_tests import FAMILYWISE
 
 
@@ -80,3 +80,28 @@ def test_of_many_windows_some_are_compared() -> None:
     truth = np.repeat([1.0, 2.0], 500)
     found = levels(truth + 0.1 * np.random.default_rng(0).normal(size=1000), np.full(1000, 0.1))
     assert [one.last for one in found] == [499, 999]
+
+
+@pytest.mark.parametrize(
+    ("name", "course"),
+    [
+        ("the gain of a sensor", [1.0, 1.0, 1.0]),
+        ("nothing", [0.0, 0.0, 0.0]),
+        ("stiffness alone", [0.0, 0.0, 1.0]),
+        ("damping and stiffness", [0.0, 1.0, 1.0]),
+        ("the body, and more than it the muscles", [0.5, 1.5, 1.5]),
+    ],
+)
+def test_a_gain_that_changes_changes_all_parameters_alike(name: str, course: list[float]) -> None:
+    found = []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        truth = np.array([0.015, 0.7, 60.0]) * (1 + 0.2 * np.outer(np.linspace(0, 1, 30), course))
+        stderr = truth * [0.02, 0.03, 0.02]
+        found.append(common_gain(truth + stderr * random.normal(size=truth.shape), stderr, np.full(30, 80.0), 0))
+    if name != "the gain of a sensor":
+        assert not any(found)
+        return
+    assert sum(one is not None for one in found) >= 19
+    gains = [(one.low, one.high) for one in found if one is not None]
+    np.testing.assert_allclose(np.mean(gains, axis=0), [1 - 0.2 / 2.6, 1 + 0.2 / 2.6], atol=0.02)
