@@ -195,6 +195,11 @@ class Chain(Model):
         return tuple(roles[k] for k in self.base.kept)
 
     @property
+    def standard_units(self) -> tuple[str, ...]:
+        """Of `base.standard_names`."""
+        return tuple(unit for _, unit, _ in self._standard())
+
+    @property
     def parameters(self) -> Numbers:
         """(p,) base parameters of the URDF: with them the torque is that of `inverse_dynamics` and its friction."""
         return np.asarray(self.base.map, float) @ np.asarray(self.standard_parameters, float)

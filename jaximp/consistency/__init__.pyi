@@ -1,0 +1,10 @@
+from .cone import Cone as Cone
+from .cone import cone_of as cone_of
+from .export import Exported as Exported
+from .export import export_urdf as export_urdf
+from .programs import ConsistentFit as ConsistentFit
+from .programs import Ranges as Ranges
+from .programs import consistent_fit as consistent_fit
+from .programs import consistent_ranges as consistent_ranges
+from .sampling import ConsistentPosterior as ConsistentPosterior
+from .sampling import consistent_posterior as consistent_posterior
