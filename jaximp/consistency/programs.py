@@ -34,6 +34,8 @@ LARGE, LARGER, GROWS = 1e2, 1e4, 1.2
 """Where the solver finds no end, links are limited to so many times the URDF's moments: what grows by this factor from
 the one to the other has none."""
 
+TIGHT = 1e-11
+"""Of the solver where a weak cost is to be seen."""
 SOLVED = ("optimal", "optimal_inaccurate")
 
 Masses = Mapping[str, tuple[float, float]]
@@ -202,8 +204,9 @@ def consistent_ranges(
     low, high = (np.where(abs(x) < NOTHING * natural, 0.0, x) for x in (low, high))
     signed = ~cone.positive[index] & ~np.array([name.endswith(NEVER_NEGATIVE) for name in names], bool)
     low = np.where(signed, low, np.maximum(low, 0.0))
-    size = np.where(signed, np.maximum(abs(low + high) / 2, natural), (low + high) / 2)
-    determined = np.isfinite(low) & np.isfinite(high) & (high - low <= 2 * DETERMINED * size)
+    ended = np.isfinite(low) & np.isfinite(high)
+    middle = abs(np.where(ended, low, 0.0) + np.where(ended, high, 0.0)) / 2
+    determined = ended & (high - low <= 2 * DETERMINED * np.where(signed, np.maximum(middle, natural), middle))
     units, notes = tuple(cone.units[k] for k in index), list(cone.notes)
     if distance**2 > farther:
         notes.append(
@@ -286,7 +289,7 @@ def _nearest(program: _Program, weight: float) -> tuple[Numbers, float]:
     cp, k = program.cp, program.posed.known
     costs = [scale * cp.sum_squares(part) for scale, part in ((1.0, program.y[:k]), (weight, program.y[k:])) if part.size]
     problem = cp.Problem(cp.Minimize(sum(costs)), program.constraints)
-    status = _solve(cp, problem)
+    status = _solve(cp, problem, tol_gap_abs=TIGHT, tol_gap_rel=TIGHT)
     if status not in SOLVED:
         raise ValueError(
             f"no robot was found near the estimate (the solver says {status}): widen the masses, and look for estimates "
@@ -296,14 +299,14 @@ def _nearest(program: _Program, weight: float) -> tuple[Numbers, float]:
     return y, float(np.linalg.norm(y[:k]))
 
 
-def _solve(cp: Any, problem: Any) -> str:
+def _solve(cp: Any, problem: Any, **settings: float) -> str:
     """The status; the solver's own warnings are kept from the terminal."""
     import warnings
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            problem.solve(solver=cp.CLARABEL)
+            problem.solve(solver=cp.CLARABEL, **settings)
         except cp.error.SolverError:
             return "failed"
     return str(problem.status)

@@ -76,8 +76,8 @@ class ConsistentDensity(eqx.Module):
 
     def __call__(self, y: Num[AnyArray, " P"]) -> Float[Array, ""]:
         y = jnp.asarray(y)
-        links = self.start + (self.links * y).sum(axis=-1)
-        joints = self.at_joints[0] + (self.at_joints[1] * y).sum(axis=-1)
+        links = self.start + self.links @ y
+        joints = self.at_joints[0] + self.at_joints[1] @ y
         positive = np.array(self.positive, bool)
         log_joints = jnp.log(jnp.where(positive, joints, 1.0)).sum() - (joints**2).sum() / 2
         return -(y[: self.known] ** 2).sum() / 2 + _log_prior(links, *self.shape).sum() + log_joints
@@ -107,7 +107,7 @@ def consistent_posterior(
     covariance: Num[AnyArray, "p p"],
     *,
     spread: float = 0.5,
-    ess: float = 1000,
+    ess: float = 400,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ConsistentPosterior:
