@@ -1,4 +1,5 @@
 from . import batch as batch
+from . import consistency as consistency
 from . import design as design
 from . import identification as identification
 from . import jobs as jobs

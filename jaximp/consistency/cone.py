@@ -2,9 +2,9 @@
 
 A link is real if the matrix of its moments of mass is positive definite (Wensing, Kim and Slotine 2018); rotors'
 inertias and friction are at least zero. With `P0 = T T'` the matrix of the URDF's own link and `P = T S T'` that of
-another, `S` is the identity for the URDF, it has no unit, and `P` is positive definite where `S` is. The coordinates `x`
-of a link are the ten numbers of `S - I`: the length of `x` is the affine-invariant distance of two links close to the
-URDF's (Lee, Wensing and Park 2020, sec. IV).
+another, `S` is the identity for the URDF, it has no unit, and `P` is positive definite where `S` is. A link's
+coordinates `x` are the ten numbers of `S - I`, and near the URDF their length is the affine-invariant distance from it
+(Lee, Wensing and Park 2020).
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ class Cone:
 
     def coordinates(self, standard: Num[AnyArray, " P"]) -> Numbers:
         """(P,) of standard parameters."""
-        return np.linalg.solve(self.scale, np.asarray(standard, float) - self.reference)
+        return np.asarray(np.linalg.solve(self.scale, np.asarray(standard, float) - self.reference), float)
 
     def smallest(self, standard: Num[AnyArray, " P"]) -> Numbers:
         """(n_b,) smallest eigenvalue of each link's matrix, as a share of the URDF's: above zero for real bodies."""
         x = self.coordinates(standard)[: 10 * self.n_bodies].reshape(-1, 10)
-        return np.linalg.eigvalsh(np.eye(4) + np.tensordot(x, BASIS, 1))[:, 0]
+        return np.asarray(np.linalg.eigvalsh(np.eye(4) + np.tensordot(x, BASIS, 1))[:, 0], float)
 
     def holds(self, standard: Num[AnyArray, " P"]) -> bool:
         """Whether every link is a real body, and rotors and friction are at least zero."""
@@ -90,15 +90,12 @@ def cone_of(chain: Chain) -> Cone:
     sizes, positive = _sizes_of_joints(chain, links), np.zeros(P, bool)
     scale[range(links.size, P), range(links.size, P)] = sizes
     positive[links.size : P - n * chain.offset] = True
-    # A link's factors are many orders of magnitude apart, but each block is well solved by itself.
-    return Cone(
-        chain.base.standard_names, chain.standard_units, len(links), reference, scale, positive, tuple(notes)
-    )
+    return Cone(chain.base.standard_names, chain.standard_units, len(links), reference, scale, positive, tuple(notes))
 
 
 def upper_factor(P: Numbers) -> Numbers:
     """Upper triangular T with `P = T T'`, of a positive definite matrix."""
-    return np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1]
+    return np.asarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1], float)
 
 
 def _possible(chain: Chain) -> tuple[Numbers, list[str]]:
@@ -189,7 +186,8 @@ def pose(chain: Chain, estimate: Num[AnyArray, " p"], covariance: Num[AnyArray, 
     # B scale = R' Q': the columns of Q beyond the first are what moves no base parameter.
     Q, R = np.linalg.qr((B @ cone.scale).T, mode="complete")
     k = len(theta)
-    back: Numbers = np.linalg.solve(R[:k].T, np.column_stack([theta - B @ cone.reference, L])) if k else np.zeros((0, 1))
+    errors = np.column_stack([theta - B @ cone.reference, L])
+    back: Numbers = np.linalg.solve(R[:k].T, errors) if k else errors
     return Posed(cone, Q[:, :k] @ back[:, 0], np.hstack([Q[:, :k] @ back[:, 1:], Q[:, k:]]), k)
 
 
@@ -199,8 +197,8 @@ def _factor(C: Numbers, names: Sequence[str]) -> Numbers:
     bad = ~(np.isfinite(size) & (size > 0))
     if bad.any():
         raise ValueError(
-            f"the variance of {names[int(bad.argmax())]} is {np.diag(C)[bad][0]:g}: it must be above zero; pass NaN for "
-            "the estimate of what was not determined"
+            f"the variance of {names[int(bad.argmax())]} is {np.diag(C)[bad][0]:g}: it must be above zero; pass NaN "
+            "for the estimate of what was not determined"
         )
     try:
         return size[:, None] * np.linalg.cholesky(C / np.outer(size, size))

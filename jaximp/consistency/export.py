@@ -30,7 +30,7 @@ class Exported:
     file_value: Numbers
     """(P,) of the original URDF."""
     source: tuple[str, ...]
-    """(P,) `data` or `prior`, which is the URDF; `not written` for what joints have: a URDF has no place for most of it."""
+    """(P,) `data` or `prior`, which is the URDF; `not written` for what joints have: a URDF lacks a place for most."""
 
     def columns(self) -> list[Column]:
         """The table: parameter, unit, value, that of the original file, and whether the data or the prior say so."""
@@ -115,15 +115,17 @@ def _inertial(k: int, link: Numbers) -> str:
 
 def _comment(chain: Chain, found: Exported) -> bytes:
     """Which numbers the data determined, link by link."""
-    lines = ["Inertial parameters by jaximp, about the origin of each link's frame. Determined by data, or kept from the"]
+    lines = [
+        "Inertial parameters by jaximp, about the origin of each link's frame. Determined by data, or kept from the"
+    ]
     lines.append("original file (prior) as far as a real body with the same torques can keep them:")
     for k, names in enumerate(chain.link_names):
         at = range(10 * k, 10 * k + 10)
-        by = {
-            mark: [found.names[j].split(".")[1] for j in at if found.source[j] == mark] for mark in ("data", "prior")
-        }
+        by = {mark: [found.names[j].split(".")[1] for j in at if found.source[j] == mark] for mark in ("data", "prior")}
         lump = f" (with {listed(names[1:])}, whose inertial is in this sum)" if len(names) > 1 else ""
-        lines.append(f"{names[0]}{lump}: data {', '.join(by['data']) or 'none'}; prior {', '.join(by['prior']) or 'none'}")
+        lines.append(
+            f"{names[0]}{lump}: data {', '.join(by['data']) or 'none'}; prior {', '.join(by['prior']) or 'none'}"
+        )
     # Two hyphens would end a comment too early.
     text = "\n  ".join(lines).replace("--", "- -")
     return f"\n  <!-- {escape(text)} -->".encode()

@@ -46,15 +46,15 @@ Masses = Mapping[str, tuple[float, float]]
 class ConsistentFit(Result):
     """Standard parameters of the robot that is nearest to an estimate."""
 
-    names: tuple[str, ...]  # type: ignore[misc]
+    names: tuple[str, ...]
     """Of the P standard parameters."""
-    units: tuple[str, ...]  # type: ignore[misc]
+    units: tuple[str, ...]
     standard: Numbers
     """(P,) every link of them is a real body; what no motion shows is as near to the URDF's as can be."""
     base: Numbers
     """(p,) base parameters of these."""
     distance: float
-    """From the estimate, in its standard errors: the square root of `d' C^-1 d`. Zero if the estimate was consistent."""
+    """From the estimate, in its standard errors: the root of `d' C^-1 d`. Near zero if the estimate is a robot's."""
     reference: Numbers
     """(P,) the URDF's own values."""
     notes: tuple[str, ...]
@@ -144,7 +144,7 @@ def consistent_fit(
     that no robot can have, and without cvxpy.
 
     **Source:** Sousa and Cortesão 2014 (base parameters within the cone); Wensing, Kim and Slotine 2018, eq. (8); Lee,
-    Wensing and Park 2020, sec. IV (distance).
+    Wensing and Park 2020 (distance).
     """
     posed = pose(chain, estimate, covariance)
     y, distance = _nearest(_Program(posed, masses, MARGIN), weight)
@@ -210,8 +210,8 @@ def consistent_ranges(
     units, notes = tuple(cone.units[k] for k in index), list(cone.notes)
     if distance**2 > farther:
         notes.append(
-            f"no real robot lies within the errors of the estimate: the nearest is {distance:.3g} standard errors away; "
-            "errors are claimed too small, or the model lacks something"
+            f"no real robot lies within the errors of the estimate: the nearest is {distance:.3g} standard errors "
+            "away; errors are claimed too small, or the model lacks something"
         )
     return Ranges(names, units, low, high, determined, level, distance, tuple(notes))
 
@@ -242,9 +242,13 @@ class _Program:
             constraints += [link >> margin * np.eye(4)] + [cp.trace(link) <= largest] * (largest is not None)
         if cone.positive.any():
             sizes = np.diag(cone.scale)[cone.positive]
-            constraints.append((posed.slope[cone.positive] / sizes[:, None]) @ y + posed.offset[cone.positive] / sizes >= 0)
+            constraints.append(
+                (posed.slope[cone.positive] / sizes[:, None]) @ y + posed.offset[cone.positive] / sizes >= 0
+            )
         for row, value, least, most in _limits_of_masses(posed, masses):
-            constraints += [row @ y + value >= least] * (least > 0) + [row @ y + value <= most] * bool(np.isfinite(most))
+            constraints += [row @ y + value >= least] * (least > 0) + [row @ y + value <= most] * bool(
+                np.isfinite(most)
+            )
         if radius is not None and posed.known:
             constraints.append(cp.norm(y[: posed.known]) <= radius)
         self.constraints = constraints
@@ -287,13 +291,15 @@ class _Search:
 def _nearest(program: _Program, weight: float) -> tuple[Numbers, float]:
     """(P,) the numbers of the nearest robot, and its distance from the estimate."""
     cp, k = program.cp, program.posed.known
-    costs = [scale * cp.sum_squares(part) for scale, part in ((1.0, program.y[:k]), (weight, program.y[k:])) if part.size]
+    costs = [
+        scale * cp.sum_squares(part) for scale, part in ((1.0, program.y[:k]), (weight, program.y[k:])) if part.size
+    ]
     problem = cp.Problem(cp.Minimize(sum(costs)), program.constraints)
     status = _solve(cp, problem, tol_gap_abs=TIGHT, tol_gap_rel=TIGHT)
     if status not in SOLVED:
         raise ValueError(
-            f"no robot was found near the estimate (the solver says {status}): widen the masses, and look for estimates "
-            "that are far from what a robot can have"
+            f"no robot was found near the estimate (the solver says {status}): widen the masses, and look for "
+            "estimates that are far from what a robot can have"
         )
     y = np.asarray(program.y.value, float)
     return y, float(np.linalg.norm(y[:k]))

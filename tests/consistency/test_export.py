@@ -55,7 +55,9 @@ def test_the_file_read_again_moves_as_the_parameters_say(case: str, tmp_path: Pa
     assert comment is not None
     for names in chain.link_names:
         assert names[0] in comment[0]
-    left = [re.sub(r"<inertial>.*?</inertial>", "", x, flags=re.DOTALL) for x in (written.replace(comment[0], ""), text)]
+    left = [
+        re.sub(r"<inertial>.*?</inertial>", "", x, flags=re.DOTALL) for x in (written.replace(comment[0], ""), text)
+    ]
     assert left[0].replace("<link name='empty' ></link>", "<link name='empty' />") == left[1]
 
     table = {column.name: column.values for column in found.columns()}
