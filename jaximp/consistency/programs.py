@@ -190,7 +190,8 @@ def consistent_ranges(
         if name not in known:
             raise ValueError(f"there is no standard parameter '{name}': {nearest(name, known)}")
     _, distance = _nearest(_Program(posed, masses, MARGIN), WEAK)
-    farther = float(chdtri(posed.known if simultaneous else 1, 1 - level)) if posed.known else 0.0
+    region = float(chdtri(posed.known, 1 - level)) if posed.known else 0.0
+    farther = region if simultaneous else min(region, float(chdtri(1, 1 - level)))
     radius = float(np.sqrt(distance**2 + farther))
     search, ends = _Search(posed, masses, radius), []
     for k, name in enumerate(names):
@@ -208,7 +209,7 @@ def consistent_ranges(
     middle = abs(np.where(ended, low, 0.0) + np.where(ended, high, 0.0)) / 2
     determined = ended & (high - low <= 2 * DETERMINED * np.where(signed, np.maximum(middle, natural), middle))
     units, notes = tuple(cone.units[k] for k in index), list(cone.notes)
-    if distance**2 > farther:
+    if distance**2 > region:
         notes.append(
             f"no real robot lies within the errors of the estimate: the nearest is {distance:.3g} standard errors "
             "away; errors are claimed too small, or the model lacks something"
