@@ -67,6 +67,7 @@ def test_far_from_the_boundary_base_parameters_are_as_estimated() -> None:
     assert high > 1.5 * low
 
 
+@pytest.mark.slow
 def test_near_the_boundary_it_is_the_prior_weighted_by_the_likelihood() -> None:
     """By draws of the prior, each with the weight that the estimate gives it."""
     theta, C = estimated(PENDULUM, another(PENDULUM, 3, 0.2), 0.4)
