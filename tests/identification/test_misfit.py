@@ -81,6 +81,17 @@ def test_what_is_missing_is_found_and_named(ankles: ModuleType, wrong: str, word
     assert said == pytest.approx(needed, abs=3.5 * error + 0.3 * abs(needed))
 
 
+def test_a_sensor_with_a_gain_for_each_direction_leaves_no_parameter_trusted(ankles: ModuleType) -> None:
+    """Either gain may be right: what the columns would move is not how far parameters are off."""
+    for k in range(3):
+        recording = ankles.record(np.random.default_rng((21, k)), rate=RATE, seconds=60.0)
+        torque = recording.torque * np.where(recording.torque > 0, 1.2, 1.0)
+        found = estimate(ankles.pipeline(RATE), replace(recording, torque=torque))[0]
+        assert not found.trusted.any()
+        for name in ("inertia", "damping", "stiffness"):
+            assert "cannot be told" in found.lacking[name]
+
+
 def test_clocks_that_drift_apart_are_judged_by_the_ends_of_the_record(ankles: ModuleType) -> None:
     """On the mean over the record they move nothing."""
     estimates = identified(ankles, "clocks 100 ppm apart", records=4, seconds=60.0)
