@@ -26,6 +26,7 @@ import numpy as np
 from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.mapping import columns_of, is_number
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers.formats import FORMATS, count_samples
 from jaximp.recordings.readers.text import delimiter_of
@@ -396,7 +397,7 @@ def padded_sizes(samples: Sequence[int], most: int = MOST_SIZES) -> list[int]:
     return sizes[::-1]
 
 
-def _sized(item: Item, columns: Sequence[str]) -> Item:
+def _sized(item: Item, columns: Sequence[str | int]) -> Item:
     """The item with its number of samples, or with why it is refused."""
     files = [file for file in (item.file, item.robot_file, item.robot_file_after) if file is not None]
     refused = next(filter(None, map(why_refused, files)), "")
@@ -411,15 +412,12 @@ def _sized(item: Item, columns: Sequence[str]) -> Item:
     return replace(item, samples=samples)
 
 
-def channel_columns(table: Mapping[str, Any]) -> list[str]:
+def channel_columns(table: Mapping[str, Any]) -> list[str | int]:
     """The columns of every channel that a `[recording]` table names, as far as that can be told."""
-    names: list[str] = []
+    names: list[str | int] = []
     channels = "position", "torque", "velocity", "acceleration", "force", "reference", "command", "time", "sample_rate"
     for channel in channels:
-        entry = table.get(channel)
-        entry = entry.get("column") if isinstance(entry, Mapping) else entry
-        several = entry if isinstance(entry, list | tuple) else ()
-        names += [entry] if isinstance(entry, str) else [name for name in several if isinstance(name, str)]
+        names += columns_of(table.get(channel)) if channel != "sample_rate" or not is_number(table.get(channel)) else ()
     return names
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -12,10 +13,11 @@ from jaximp import signals
 from jaximp.identification.filter_settings import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
 from jaximp.trust.limits import TrustLimits
-from jaximp.types import AnyArray, Recording, nearest
+from jaximp.types import AnyArray, Numbers, Recording, nearest
 
 NOISE = ["estimated", "filtered"]
 """Choices of `WindowSettings.noise`."""
@@ -31,8 +33,9 @@ ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 class WindowSettings:
     """Windows and the samples that count in them."""
 
-    length: float
-    """Length of the sliding window [s]."""
+    length: float = math.inf
+    """Length of the sliding window [s]. `"all"` takes the whole recording as one window, which is the default for
+    robots from a URDF; others need a length."""
     step: float | None = None
     """From one window to the next [s]; by default a fiftieth of the length."""
     noise: str = "estimated"
@@ -42,7 +45,8 @@ class WindowSettings:
     """How noise that is estimated is used. `generalised` least squares count every frequency as much as its noise
     allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise."""
     min_velocity: float = 0.0
-    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
+    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says.
+    Of several joints only the rows of those that are slow."""
 
     @property
     def step_seconds(self) -> float:
@@ -61,7 +65,7 @@ class Pipeline:
     """Of the recordings [Hz]."""
     model: Model
     """What is identified in the windows."""
-    window: WindowSettings
+    window: WindowSettings = field(default_factory=WindowSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
     limits: TrustLimits = field(default_factory=TrustLimits)
     robot: Model | None = None
@@ -83,6 +87,11 @@ class Pipeline:
         return design_filters(self.filter, self.sample_rate)
 
     @property
+    def gap(self) -> int:
+        """Samples between recordings that are one, so that what one of them does to the filters has died out."""
+        return 2 * self.filters.reach
+
+    @property
     def once(self) -> bool:
         """Whether the filters run over the recording once, and not inside every window."""
         return self.filter.mode == "once"
@@ -96,6 +105,21 @@ class Pipeline:
     def ordinary(self) -> bool:
         """Whether the noise is estimated, but only the standard errors of ordinary least squares use it."""
         return self.whitens and self.window.estimates == "ordinary"
+
+    @property
+    def min_velocity(self) -> Numbers:
+        """() or (n,): slower rows of a joint do not count [rad/s or m/s]."""
+        of_model = self.model.min_velocity if isinstance(self.model, Chain) else 0.0
+        return np.maximum(self.window.min_velocity, of_model)
+
+    @property
+    def whole(self) -> bool:
+        """Whether a recording is one window."""
+        return math.isinf(self.window.length)
+
+    def of_length(self, samples: int) -> Pipeline:
+        """With the window of a recording of so many samples, where it is the whole recording."""
+        return self.with_window(samples / self.sample_rate, samples / self.sample_rate) if self.whole else self
 
     @property
     def window_samples(self) -> int:

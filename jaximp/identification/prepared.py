@@ -31,6 +31,7 @@ from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.recordings.delays import moved_forward
+from jaximp.recordings.join import join_recordings
 from jaximp.types import Recording, RobotAlone
 
 CLEARLY_MORE = 1.5
@@ -119,8 +120,14 @@ def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
     return noise_in_windows(pipeline)
 
 
-def prepare(pipeline: Pipeline, recording: Recording, alone: RobotAlone = None) -> Prepared:
-    """Filter a recording, and that of the robot alone (or both of them) where there is a pair."""
+def prepare(pipeline: Pipeline, recording: Recording | Sequence[Recording], alone: RobotAlone = None) -> Prepared:
+    """Filter a recording, and that of the robot alone (or both of them) where there is a pair.
+
+    Several recordings are one, in which no filter crosses from one into the next.
+    """
+    if not isinstance(recording, Recording):
+        recording = join_recordings(recording, pipeline.gap)
+    pipeline = pipeline.of_length(len(recording))
     recording = without_unknown_delay(pipeline, recording)
     if pipeline.robot is not None:
         given = () if alone is None else alone if isinstance(alone, tuple) else (alone,)

@@ -225,7 +225,12 @@ class Chain(Model):
 
     def moving(self, dq: Num[ArrayLike, "... n"]) -> Array:
         """(..., n) whether each joint's motor is at least at `min_velocity`, so that its row counts for friction."""
-        return jnp.abs(jnp.asarray(dq) @ jnp.asarray(self.motors).T) >= jnp.asarray(self.min_velocity)
+        return self.speed(dq) >= jnp.asarray(self.min_velocity)
+
+    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
+        """Of the motors."""
+        motors, dq = jnp.asarray(self.motors), jnp.asarray(dq)
+        return jnp.abs(dq @ motors.T if self.n_joints > 1 else dq * motors[0, 0])
 
     def joint_positions(self, q: Num[ArrayLike, "... n"]) -> Float[Array, "... n_b"]:
         """Positions of all joints that move, as the URDF means them, from the recorded ones."""
