@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import glob
+import math
 import os
 import re
 import stat
@@ -119,9 +120,10 @@ class Plan:
         lines += [f"refused: {item.name}: {item.refused}" for item in refused[:MOST_NAMED]]
         lines += [f"refused: {len(refused) - MOST_NAMED} others"] if len(refused) > MOST_NAMED else []
         model = job.model
-        which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
+        which = [name for name in ("robot", "human", "arm", "chain") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
-        windows = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
+        every = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
+        windows = "each recording as one window" if math.isinf(job.window.length) else every
         lines.append(f"model: {' and '.join(which)}{methods}; {windows}")
         counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
         for (size, stacked), count in sorted(counts.items()):
@@ -142,7 +144,8 @@ def expected_bytes(job: WindowJob, plan: Plan) -> float:
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
     length, step = job.window.length, job.window.step_seconds
-    windows = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items)
+    many = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items if math.isfinite(length))
+    windows = many if math.isfinite(length) else len(plan.items)
     files = sum(len({item.partition(plan.partitions) for item in batch.items}) for batch in plan.batches)
     return 120.0 * windows + 16_000.0 * files + 30_000.0 * len(plan.batches) + 2000.0 * len(plan.items)
 

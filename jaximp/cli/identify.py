@@ -39,7 +39,7 @@ def identify_into(job: Job, folder: Path) -> None:
     if isinstance(job, TrialsJob):
         _identify_trials_into(job, folder)
         return
-    from jaximp.identification.identify import at_other_lengths, in_windows
+    from jaximp.identification.identify import at_other_lengths, in_windows, longest_of
     from jaximp.jobs.run import prepare
 
     # Figures take long to import: that is done while the other core compiles.
@@ -47,9 +47,9 @@ def identify_into(job: Job, folder: Path) -> None:
     with bar_of("identifying") as progress:
         recording, alone = job.load(), job.load_robot_alone()
         progress(0.1)
-        prepared = prepare(job, recording, alone)
+        prepared = prepare(job, recording, alone, job.load_held_out())
         progress(0.3)
-        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
+        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), longest_of(prepared))
         others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp.identification.residuals import Residuals
 from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, parameter_units
@@ -121,6 +122,12 @@ class Estimates(Result):
     """Parameters that are not the same in windows that share no rows, and what they are when, in words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
+    residuals: Residuals | None = None
+    """What the parameters of the whole recording leave of its torque, of each joint."""
+    held_out: Residuals | None = None
+    """What they leave of a recording that they have not seen, where there is one."""
+    doubted: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
+    """Of a model whose parameters are judged one by one, (M,) why each cannot be trusted; empty text where it can."""
 
     @property
     def value(self) -> NDArray[np.float64]:
@@ -158,6 +165,8 @@ class Estimates(Result):
 
     def trusted_in(self, name: str) -> NDArray[np.bool_]:
         """(M,) which windows can be trusted in one parameter: what the model lacks may spare it."""
+        if name in self.doubted:
+            return np.asarray(self.verdicts.trusted & (self.doubted[name] == ""))
         spared = name not in self.lacking and self.verdicts.rule == NOTHING_MISSING
         return np.asarray(self.verdicts.trusted | spared)
 

@@ -88,8 +88,8 @@ class Pipeline:
 
     @property
     def gap(self) -> int:
-        """Samples between recordings that are one, so that what one of them does to the filters has died out."""
-        return 2 * self.filters.reach
+        """Samples between recordings that count as one."""
+        return gap_between(self.filters)
 
     @property
     def once(self) -> bool:
@@ -207,6 +207,11 @@ class Pipeline:
         if len(reference) < round(self.reference * rate) or not np.isfinite(reference).all():
             return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
         return reference, *signals.differentiate(reference, rate, self.filters.differentiator)
+
+
+def gap_between(filters: Filters) -> int:
+    """Samples between recordings that count as one: what one of them does to the filters has died out by then."""
+    return 2 * filters.reach
 
 
 def _check_elbow(recording: Recording) -> None:

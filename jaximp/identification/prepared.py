@@ -80,6 +80,8 @@ class Prepared:
     """What is known of what moves each joint (of joints side by side), where something is."""
     explained: Recording | None = None
     """With the part of the motion that a reference explains, where the rows are those of this part."""
+    held_out: Rows | None = None
+    """Of a recording that the estimates are to predict."""
 
     @property
     def drive(self) -> Drive | None:
@@ -120,11 +122,23 @@ def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
     return noise_in_windows(pipeline)
 
 
-def prepare(pipeline: Pipeline, recording: Recording | Sequence[Recording], alone: RobotAlone = None) -> Prepared:
+def prepare(
+    pipeline: Pipeline,
+    recording: Recording | Sequence[Recording],
+    alone: RobotAlone = None,
+    held_out: Recording | None = None,
+) -> Prepared:
     """Filter a recording, and that of the robot alone (or both of them) where there is a pair.
 
-    Several recordings are one, in which no filter crosses from one into the next.
+    Several recordings are one, in which no filter crosses from one into the next. `held_out` is one that the estimates
+    are to predict.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
+    if held_out is not None:
+        check_held_out(pipeline, recording, held_out)
+        rows = regress(measure(pipeline, without_unknown_delay(pipeline, held_out)))[0]
+        return replace(prepare(pipeline, recording, alone), held_out=rows)
     if not isinstance(recording, Recording):
         recording = join_recordings(recording, pipeline.gap)
     pipeline = pipeline.of_length(len(recording))
@@ -138,6 +152,22 @@ def prepare(pipeline: Pipeline, recording: Recording | Sequence[Recording], alon
     if pipeline.once:
         return _prepared(measured, *regress(measured))
     return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
+
+
+def check_held_out(pipeline: Pipeline, recording: Recording | Sequence[Recording], held_out: Recording) -> None:
+    """Refuse a recording that the estimates of another one cannot predict."""
+    if pipeline.robot is not None or not pipeline.once:
+        raise ValueError(
+            "a recording can be held out of one model alone, with filter.mode = 'once': leave held_out out"
+        )
+    first = recording if isinstance(recording, Recording) else recording[0]
+    if held_out.joints != first.joints:
+        raise ValueError(f"{held_out.name}, which is held out, has other joints than {first.name}: map the same ones")
+    if abs(held_out.sample_rate - pipeline.sample_rate) > 1e-3 * pipeline.sample_rate:
+        raise ValueError(
+            f"{held_out.name}, which is held out, was sampled at {held_out.sample_rate:g} Hz and {first.name} at "
+            f"{pipeline.sample_rate:g} Hz: resample one of them"
+        )
 
 
 def without_unknown_delay(pipeline: Pipeline, recording: Recording) -> Recording:

@@ -53,6 +53,13 @@ def join_recordings(several: Sequence[Recording], gap: int) -> Recording:
     )
 
 
+def part_of(recording: Recording, begin: float, end: float) -> Recording:
+    """The samples from one share of a recording to another."""
+    here = slice(round(begin * len(recording)), round(end * len(recording)))
+    arrays = {name: getattr(recording, name) for name in ("time", "valid", "clipped", *CHANNELS)}
+    return replace(recording, **{name: array[here] for name, array in arrays.items() if array is not None})
+
+
 def _channels(recording: Recording) -> list[str]:
     return [name for name in CHANNELS if getattr(recording, name) is not None]
 
