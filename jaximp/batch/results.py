@@ -349,4 +349,5 @@ def write_report_of(job: WindowJob, recording: Recording, alone: RobotAlone, fol
     estimates = in_windows(prepared, longest=longest_of(prepared))
     others = at_other_lengths(prepared, alone)
     with new_folder(folder, force=True) as draft:
-        write_results(draft, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
+        lengths = [] if longest_of(prepared) is None else sorted([estimates[0], *others], key=lambda e: e.window)
+        write_results(draft, estimates, lengths, job, recording)

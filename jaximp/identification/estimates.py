@@ -193,6 +193,16 @@ class Estimates(Result):
         }
         return units.pop() if len(units) == 1 else "mixed"
 
+    def on_held_out(self) -> Estimates:
+        """With the torque of the recording that was held out in place of its own, for figures."""
+        found = self.held_out
+        if found is None:
+            raise ValueError("no recording was held out: pass held_out to estimate")
+        unseen = np.full_like(found.predicted, np.nan)
+        return replace(
+            self, time=found.time, torque=found.torque, reconstructed=found.predicted, predicted=unseen, notes=()
+        )
+
     def columns(self) -> list[Column]:
         """A row for each window: as in `estimates.parquet`."""
         fit = self.fit

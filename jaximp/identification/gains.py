@@ -26,7 +26,7 @@ def by_gain(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement) -
     if n == 1:
         return theta[None]
     from_white = bool(prepared.white) and not prepared.pipeline.ordinary
-    solved = prepared.white[0] if from_white else rows
+    solved = prepared.white[0] if from_white else prepared.weighted or rows
     slide = partial(sliding_least_squares, window=place.window, step=place.step, valid=jnp.asarray(rows.valid))
     W, torque = jnp.asarray(solved.W), np.asarray(solved.torque)
     alone = [np.where(np.arange(n) == j, torque, 0.0) for j in range(n)]

@@ -25,6 +25,7 @@ from jaximp.identification.robot_changes import Doubts, Sameness
 from jaximp.identification.rows import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
+from jaximp.identification.weighted import weighted_fit
 from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
@@ -111,6 +112,10 @@ def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, c
     if prepared.pair is not None:
         return _by_methods(prepared, prepared.pair, place, progress, curves)
 
+    if prepared.weighted is not None:
+        fit = weighted_fit(rows, prepared.weighted, place)
+        misfits = _misfits(prepared, fit)
+        return [judge(prepared, rows, _predict(rows, fit, place), place, curves=curves, misfits=misfits)]
     white, ordinary = prepared.white[0] if prepared.white else None, prepared.pipeline.ordinary
     solve = partial(sliding_least_squares, window=place.window, step=place.step, room=place.given_room)
     solve = partial(solve, valid=jnp.asarray(rows.valid), noise=None if white else prepared.noise)

@@ -164,7 +164,7 @@ def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement
     inside windows do."""
     if len(prepared.white) != 1:
         return fit
-    solved = rows if prepared.pipeline.ordinary else prepared.white[0]
+    solved = (prepared.weighted or rows) if prepared.pipeline.ordinary else prepared.white[0]
     drive = prepared.drive
     if drive is not None and drive.W is not None:
         both = np.concatenate([drive.W, np.asarray(drive.torque)[:, None]], axis=1)

@@ -41,9 +41,11 @@ class WindowSettings:
     noise: str = "estimated"
     """Of the torque: `estimated` from what windows leave of it, whatever its colour; `filtered` takes it as white
     before the filters, for ordinary least squares as in the paper."""
-    estimates: str = "generalised"
+    estimates: str | None = None
     """How noise that is estimated is used. `generalised` least squares count every frequency as much as its noise
-    allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise."""
+    allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise. By default
+    generalised, and ordinary for robots from a URDF, whose models leave more than noise: their joints are weighed by
+    what is left of each."""
     min_velocity: float = 0.0
     """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says.
     Of several joints only the rows of those that are slow."""
@@ -104,13 +106,19 @@ class Pipeline:
     @property
     def ordinary(self) -> bool:
         """Whether the noise is estimated, but only the standard errors of ordinary least squares use it."""
-        return self.whitens and self.window.estimates == "ordinary"
+        usual = ESTIMATES[1] if isinstance(self.model, Chain) else ESTIMATES[0]
+        return self.whitens and (self.window.estimates or usual) == "ordinary"
+
+    @property
+    def weighs(self) -> bool:
+        """Whether ordinary least squares of several joints weigh each by what is left of it."""
+        return self.ordinary and isinstance(self.model, Chain) and self.model.n_joints > 1
 
     @property
     def min_velocity(self) -> Numbers:
         """() or (n,): slower rows of a joint do not count [rad/s or m/s]."""
         of_model = self.model.min_velocity if isinstance(self.model, Chain) else 0.0
-        return np.maximum(self.window.min_velocity, of_model)
+        return np.asarray(np.maximum(self.window.min_velocity, of_model))
 
     @property
     def whole(self) -> bool:
@@ -164,7 +172,8 @@ class Pipeline:
             )
         if self.window.noise not in NOISE:
             raise ValueError(f"window.noise is '{self.window.noise}': {nearest(self.window.noise, NOISE)}")
-        if self.window.estimates not in ESTIMATES:
+        if self.window.estimates not in (None, *ESTIMATES):
+            assert self.window.estimates is not None
             hint = nearest(self.window.estimates, ESTIMATES)
             raise ValueError(f"window.estimates is '{self.window.estimates}': {hint}")
         if self.drive is not None and self.drive not in DRIVES:

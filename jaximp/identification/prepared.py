@@ -27,6 +27,7 @@ from jaximp.identification.robot_changes import (
 from jaximp.identification.rows import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
+from jaximp.identification.weighted import by_size, sizes_of_joints
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model, combine
@@ -80,6 +81,8 @@ class Prepared:
     """What is known of what moves each joint (of joints side by side), where something is."""
     explained: Recording | None = None
     """With the part of the motion that a reference explains, where the rows are those of this part."""
+    weighted: Rows | None = None
+    """In units of what is left of each joint, where joints are weighed (`Pipeline.weighs`)."""
     held_out: Rows | None = None
     """Of a recording that the estimates are to predict."""
 
@@ -101,7 +104,7 @@ class Prepared:
     @property
     def stackable(self) -> bool:
         """Whether all its windows are solved in one call, by sums that they share."""
-        return can_be_stacked(self.pipeline) and len(self.rows.time) <= MOST_ROWS
+        return can_be_stacked(self.pipeline) and self.weighted is None and len(self.rows.time) <= MOST_ROWS
 
 
 def can_be_stacked(pipeline: Pipeline) -> bool:
@@ -203,7 +206,8 @@ def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
 def with_windows(prepared: Prepared, pipeline: Pipeline) -> Prepared:
     """The same rows for windows of another length, whose noise is estimated from what they leave."""
     white = tuple(whitened(pipeline, prepared.rows)) if prepared.white else ()
-    return replace(prepared, pipeline=pipeline, white=white, solved=())
+    other = replace(prepared, pipeline=pipeline, white=white, solved=())
+    return _weighted(other) if pipeline.weighs else other
 
 
 def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:
@@ -292,9 +296,22 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
         white = (replace(one, noisy=more * np.asarray(one.noisy)),)
     if white and not pipeline.ordinary:
         noise = np.concatenate([one.column_noise for one in white])
-    return Prepared(
+    prepared = Prepared(
         recording, pipeline, rows, noise, pair, reference, measured.jumps, white, drives=drives, explained=explained
     )
+    return _weighted(prepared) if pipeline.weighs else prepared
+
+
+def _weighted(prepared: Prepared) -> Prepared:
+    """With rows in which each joint counts by what is left of it."""
+    rows, white = prepared.rows, prepared.white[0]
+    size = sizes_of_joints(rows)
+    weighted = by_size(rows, size)
+    columns = np.where(np.asarray(rows.valid)[..., None], weighted.W, 0)
+    assert weighted.noisy is not None
+    noise = np.sqrt((weighted.noisy.reshape(-1, columns.shape[-1]) ** 2).mean(axis=0))
+    white = replace(white, as_filtered=columns, counted=size)
+    return replace(prepared, weighted=weighted, white=(white,), column_noise=noise)
 
 
 def _noise_in_band(rows: Rows, white: tuple[White, ...]) -> float:

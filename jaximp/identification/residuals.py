@@ -58,17 +58,17 @@ class Residuals:
 
 
 def _squares(x: Numbers, which: NDArray[np.bool_], axis: int | None) -> Numbers:
-    return np.asarray(np.where(which, x, 0.0) ** 2).sum(axis=axis)
+    return np.asarray((np.where(which, x, 0.0) ** 2).sum(axis=axis))
 
 
 def _root_mean_square(left: Numbers, which: NDArray[np.bool_]) -> Numbers:
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(_squares(left, which, 0) / which.sum(axis=0))
+        return np.asarray(np.sqrt(_squares(left, which, 0) / which.sum(axis=0)))
 
 
 def _share(left: Numbers, torque: Numbers, which: NDArray[np.bool_], axis: int | None) -> Numbers:
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(_squares(left, which, axis) / _squares(torque, which, axis))
+        return np.asarray(np.sqrt(_squares(left, which, axis) / _squares(torque, which, axis)))
 
 
 def of_whole_recording(prepared: Prepared, theta: Numbers) -> Numbers:
@@ -76,7 +76,9 @@ def of_whole_recording(prepared: Prepared, theta: Numbers) -> Numbers:
     if len(theta) == 1:
         return np.asarray(theta[0])
     p = theta.shape[1]
-    if len(prepared.white) == 1:
+    if prepared.weighted is not None:
+        W, torque = prepared.weighted.W, prepared.weighted.torque
+    elif len(prepared.white) == 1:
         W, torque = prepared.white[0].W, prepared.white[0].torque
     else:
         W, torque = prepared.rows.W, prepared.rows.torque

@@ -346,11 +346,15 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
 
 def _window(table: Any, model: ModelSettings) -> WindowSettings:
     """`[window]`, whose length may be `"all"`."""
-    if isinstance(table, dict) and table.get("length") == "all":
+    given = table.get("length") if isinstance(table, dict) else None
+    if given == math.inf:
+        raise ValueError("window.length is inf: it must be a number above zero, or 'all'")
+    if given == "all":
         return settings(WindowSettings, {**table, "length": math.inf}, "window")
-    if isinstance(table, dict) and "length" not in table and model.chain is None:
+    window = settings(WindowSettings, table, "window")
+    if given is None and model.chain is None:
         raise ValueError("[window] has no 'length': add it")
-    return settings(WindowSettings, table, "window")
+    return window
 
 
 def _held_out(value: Any) -> Mapping[str, Any] | float | None:

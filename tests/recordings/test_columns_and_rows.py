@@ -53,7 +53,7 @@ def test_rows_count_from_one_and_hold_both_ends(tmp_path: Path) -> None:
         ({"position": "q"}, "column 'q' is not there: the first line holds numbers and no names"),
         ({"position": [2, 9]}, "column 9 is not there: the file has 5 columns"),
         ({"position": {"column": 2, "columns": [2, 3]}}, "names no column"),
-        ({"position": [2, 3.0]}, "names no column"),
+        ({"position": [2, 0]}, "names no column"),
         ({"torque": {"columns": [4, 5], "gain": [1, 2, 3]}}, "gain lists 3 numbers for 2 columns"),
         ({"torque": {"columns": [4, 5], "gain": ["1 N m/A", "2 N m/V"]}}, "different units"),
         ({"torque": {"columns": [4, 5], "gain_error": -1}}, "gain_error is -1: give per cent"),
