@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -126,7 +127,7 @@ class Estimates(Result):
     """What the parameters of the whole recording leave of its torque, of each joint."""
     held_out: Residuals | None = None
     """What they leave of a recording that they have not seen, where there is one."""
-    doubted: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
+    doubted: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Of a model whose parameters are judged one by one, (M,) why each cannot be trusted; empty text where it can."""
 
     @property

@@ -158,6 +158,11 @@ class Pipeline:
         """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees, and for
         filters that its sample rate does not allow."""
         require_float64(recording.position)
+        if isinstance(self.model, Chain) and self.model.n_joints != recording.n_joints:
+            raise ValueError(
+                f"{self.model.robot} has {self.model.n_joints} joints, but the recording {recording.n_joints}: map a "
+                "column of position and torque for each, or lock the others"
+            )
         duration = len(recording) / recording.sample_rate
         if round(self.window.length * recording.sample_rate) > len(recording):
             raise ValueError(
