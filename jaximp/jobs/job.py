@@ -435,7 +435,7 @@ def _chain(table: Mapping[str, Any]) -> ChainSettings | None:
     if not (isinstance(robot, dict) and "urdf" in robot):
         return None
     for other in ("human", "arm", "methods"):
-        if table.get(other):
+        if table.get(other, False) is not False:
             raise ValueError(f"model.robot from a URDF stands alone: leave out model.{other}")
     return settings(ChainSettings, robot, "model.robot")
 

@@ -101,7 +101,9 @@ def _judge_samples(label: str, channel: str, x: Numbers, stamps: Numbers) -> _Sa
     if wrong.any():
         faults.append(_glitches(label, wrong, stamps))
     # Uneven stamps make leaps of a motion, which no glitch must be told by, and which are no noise.
-    even = signals.noise_level(known, stamps if updates is None else stamps[updates]) if channel == "position" else level
+    even = (
+        signals.noise_level(known, stamps if updates is None else stamps[updates]) if channel == "position" else level
+    )
     return _Samples(x, spoilt, even, faults)
 
 
