@@ -205,7 +205,7 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
     return Page(
         title=recording["name"],
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
-        f"{windows['count']} windows of {digits(content['window_s'])} s{method}",
+        f"{windows['count']} window{'s' * (windows['count'] != 1)} of {digits(content['window_s'])} s{method}",
         sections=[
             Section("", [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
             _verdicts(estimates_list[0], content),
