@@ -8,7 +8,6 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
 from jaximp.cli.terminal import Force, JobFile, Out, bar_of, say_where
@@ -92,7 +91,8 @@ def _say_result(estimates: Estimates) -> None:
     if not any(map(math.isfinite, means)):
         return
     one, width = len(shown.end) == 1, max(20, *map(len, shown.names))
-    halves = np.diff(shown.interval(), axis=0)[0, 0] / 2
+    low, high = shown.interval()
+    halves = (high[0] - low[0]) / 2
     typer.echo("95 % intervals:" if one else "mean and standard deviation over the trusted windows:")
     for name, unit, mean, sd, half in zip(shown.names, shown.units, means, sds, halves, strict=True):
         spread = f"± {half:.2g}" if one else f"({sd:.2g})"
