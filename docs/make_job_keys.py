@@ -13,7 +13,7 @@ import math
 import textwrap
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from jaximp.design.limits import Limits
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
+from jaximp.jobs.chain import ChainSettings
 from jaximp.jobs.design import DesignSettings, EncoderSettings
 from jaximp.jobs.job import HumanSettings, ModelSettings, ReflexSettings, RobotSettings, WindowJob
 from jaximp.jobs.trials import STATIC_WINDOW, HandleSettings, TrialsSettings, TriggerSettings
@@ -54,7 +55,7 @@ RECORDING_JOB = (
         "At the top of the file",
         WindowJob,
         "Keys that stand in no table, above the first one.",
-        only=("reference_period", "design"),
+        only=("held_out", "reference_period", "design"),
     ),
     Table(
         "[model]",
@@ -66,6 +67,11 @@ RECORDING_JOB = (
     Table("[model.human]", HumanSettings, "A human joint: inertia, damping, stiffness and offset torque."),
     Table("[model.human.reflex]", ReflexSettings, "The stretch reflex of a human joint."),
     Table("[model.robot]", RobotSettings, "A robot's joint: its inertia, gravity and friction."),
+    Table(
+        "[model.robot] with a URDF",
+        ChainSettings,
+        "A robot of all joints that its URDF moves. It stands alone, without a human. See [robots](robots.md).",
+    ),
     Table(
         "[model.arm]",
         ArmSettings,
@@ -119,6 +125,8 @@ KINDS = {
     list[float]: "list of numbers",
     dict[str, float]: "table of numbers",
     list[str]: "list of text",
+    list[list[float]]: "list of lists of numbers",
+    Mapping[str, Any]: "table",
     tuple[str, ...]: "list of names",
     tuple[int, ...]: "list of whole numbers",
     tuple[Any, Any]: "[lowest, highest], or { low = [...], high = [...] }",
@@ -150,6 +158,8 @@ def default_of(setting: Field[Any]) -> str:
     value = setting.default if setting.default_factory is MISSING else setting.default_factory()
     if value is None or value == ():
         return ""
+    if setting.name == "length" and value == math.inf:
+        return '`"all"` for a robot from a URDF'
     if value == math.inf or value == (-math.inf, math.inf):
         return "no limit"
     if isinstance(value, bool):
@@ -182,7 +192,10 @@ def recording() -> Iterator[str]:
     yield (
         "Where the measurements are: `file`, a path that begins at the job's folder, and the columns. "
         "`[robot_recording]` has the same keys, and is the recording of the robot alone. `[robot_recording_after]` has "
-        "them too, and is a second one, made after the recording with the human: it tells how far the robot changed.\n"
+        "them too, and is a second one, made after the recording with the human: it tells how far the robot changed. "
+        "Of `[recording]` alone, `file` may be a list of files with the same columns (and `rows` a list of pairs), or "
+        "there may be several `[[recording]]` tables: they are identified together, and no filter crosses from one "
+        "into the next.\n"
     )
     yield arguments.replace("- `path`:", "- `file`:") + "\n"
 

@@ -73,6 +73,9 @@ class Recording:
     """(n,) standard deviation of the sensor of each position, where it was stated; samples may not show all of it."""
     delay_unknown: bool = False
     """Whether the delay of the torque behind the position is to be estimated and taken out."""
+    gain_covariance: NDArray[np.float64] | None = None
+    """(n, n) covariance of the relative errors of the gains behind the torques, where these are stated: a drive's gain
+    that is 3 % off makes the torque of its joint 3 % too large throughout."""
     clipped: NDArray[np.bool_] | None = None
     """(N,) True where a torque was cut off at a limit; these samples are not valid."""
     name: str = "recording"
@@ -99,6 +102,7 @@ class Recording:
         this = slice(j, j + 1)
         seen, stated = (None if noise is None else noise[this] for noise in (self.position_noise, self.stated_noise))
         reference, command = (None if x is None else x[:, this] for x in (self.reference, self.command))
+        gains = None if self.gain_covariance is None else self.gain_covariance[this, this]
         return replace(
             self,
             position=self.position[:, this],
@@ -108,6 +112,7 @@ class Recording:
             command=command,
             position_noise=seen,
             stated_noise=stated,
+            gain_covariance=gains,
         )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import glob
+import math
 import os
 import re
 import stat
@@ -26,6 +27,7 @@ import numpy as np
 from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.mapping import columns_of, is_number
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers.formats import FORMATS, count_samples
 from jaximp.recordings.readers.text import delimiter_of
@@ -118,9 +120,10 @@ class Plan:
         lines += [f"refused: {item.name}: {item.refused}" for item in refused[:MOST_NAMED]]
         lines += [f"refused: {len(refused) - MOST_NAMED} others"] if len(refused) > MOST_NAMED else []
         model = job.model
-        which = [name for name in ("robot", "human", "arm") if getattr(model, name) is not None]
+        which = [name for name in ("robot", "human", "arm", "chain") if getattr(model, name) is not None]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
-        windows = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
+        every = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
+        windows = "each recording as one window" if math.isinf(job.window.length) else every
         lines.append(f"model: {' and '.join(which)}{methods}; {windows}")
         counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
         for (size, stacked), count in sorted(counts.items()):
@@ -141,7 +144,8 @@ def expected_bytes(job: WindowJob, plan: Plan) -> float:
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
     length, step = job.window.length, job.window.step_seconds
-    windows = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items)
+    many = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items if math.isfinite(length))
+    windows = many if math.isfinite(length) else len(plan.items)
     files = sum(len({item.partition(plan.partitions) for item in batch.items}) for batch in plan.batches)
     return 120.0 * windows + 16_000.0 * files + 30_000.0 * len(plan.batches) + 2000.0 * len(plan.items)
 
@@ -396,7 +400,7 @@ def padded_sizes(samples: Sequence[int], most: int = MOST_SIZES) -> list[int]:
     return sizes[::-1]
 
 
-def _sized(item: Item, columns: Sequence[str]) -> Item:
+def _sized(item: Item, columns: Sequence[str | int]) -> Item:
     """The item with its number of samples, or with why it is refused."""
     files = [file for file in (item.file, item.robot_file, item.robot_file_after) if file is not None]
     refused = next(filter(None, map(why_refused, files)), "")
@@ -411,15 +415,12 @@ def _sized(item: Item, columns: Sequence[str]) -> Item:
     return replace(item, samples=samples)
 
 
-def channel_columns(table: Mapping[str, Any]) -> list[str]:
+def channel_columns(table: Mapping[str, Any]) -> list[str | int]:
     """The columns of every channel that a `[recording]` table names, as far as that can be told."""
-    names: list[str] = []
+    names: list[str | int] = []
     channels = "position", "torque", "velocity", "acceleration", "force", "reference", "command", "time", "sample_rate"
     for channel in channels:
-        entry = table.get(channel)
-        entry = entry.get("column") if isinstance(entry, Mapping) else entry
-        several = entry if isinstance(entry, list | tuple) else ()
-        names += [entry] if isinstance(entry, str) else [name for name in several if isinstance(name, str)]
+        names += columns_of(table.get(channel)) if channel != "sample_rate" or not is_number(table.get(channel)) else ()
     return names
 
 

@@ -341,12 +341,13 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
 
 def write_report_of(job: WindowJob, recording: Recording, alone: RobotAlone, folder: Path) -> None:
     """What `identify` writes, for one recording."""
-    from jaximp.identification.identify import at_other_lengths
+    from jaximp.identification.identify import at_other_lengths, longest_of
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.estimates import write_results
 
     prepared = prepare(job.pipeline_for(recording), recording, alone)
-    estimates = in_windows(prepared, longest=2 * job.window.length)
+    estimates = in_windows(prepared, longest=longest_of(prepared))
     others = at_other_lengths(prepared, alone)
     with new_folder(folder, force=True) as draft:
-        write_results(draft, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, recording)
+        lengths = [] if longest_of(prepared) is None else sorted([estimates[0], *others], key=lambda e: e.window)
+        write_results(draft, estimates, lengths, job, recording)

@@ -39,7 +39,7 @@ def identify_into(job: Job, folder: Path) -> None:
     if isinstance(job, TrialsJob):
         _identify_trials_into(job, folder)
         return
-    from jaximp.identification.identify import at_other_lengths, in_windows
+    from jaximp.identification.identify import at_other_lengths, in_windows, longest_of
     from jaximp.jobs.run import prepare
 
     # Figures take long to import: that is done while the other core compiles.
@@ -47,15 +47,14 @@ def identify_into(job: Job, folder: Path) -> None:
     with bar_of("identifying") as progress:
         recording, alone = job.load(), job.load_robot_alone()
         progress(0.1)
-        prepared = prepare(job, recording, alone)
+        prepared = prepare(job, recording, alone, job.load_held_out())
         progress(0.3)
-        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), 2 * job.window.length)
+        estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), longest_of(prepared))
         others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
 
-        write_results(
-            folder, estimates, sorted([estimates[0], *others], key=lambda e: e.window), job, prepared.recording
-        )
+        lengths = [] if longest_of(prepared) is None else sorted([estimates[0], *others], key=lambda e: e.window)
+        write_results(folder, estimates, lengths, job, prepared.recording)
         progress(1.0)
     _say_result(estimates[0])
 
@@ -85,18 +84,25 @@ def _say_result(estimates: Estimates) -> None:
     complaint, shown = estimates.verdicts.complaint(), estimates.summarised()
     if complaint:
         typer.echo(complaint)
+    for where, found in (("recording", estimates.residuals), ("held out", estimates.held_out)):
+        if found is not None and (estimates.held_out is not None or len(found.moving) > 1):
+            typer.echo(f"residual, {where}: {found.total:.2%} of the torque of all joints")
     means, sds, loose = shown.mean_over_trusted(), shown.sd_over_trusted(), shown.undetermined()
     if not any(map(math.isfinite, means)):
         return
-    typer.echo("mean and standard deviation over the trusted windows:")
-    for name, unit, mean, sd in zip(shown.names, shown.units, means, sds, strict=True):
-        said = f"{mean:11.4g} ({sd:.2g}) {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"
+    one, width = len(shown.end) == 1, max(20, *map(len, shown.names))
+    low, high = shown.interval()
+    halves = (high[0] - low[0]) / 2
+    typer.echo("95 % intervals:" if one else "mean and standard deviation over the trusted windows:")
+    for name, unit, mean, sd, half in zip(shown.names, shown.units, means, sds, halves, strict=True):
+        spread = f"± {half:.2g}" if one else f"({sd:.2g})"
+        said = f"{mean:11.4g} {spread} {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"
         if name in shown.changed and math.isfinite(mean):
             said = f"{'not one value':>13}: {shown.changed[name]}"
         elif name in loose:
             times = f"{loose[name]:.0%} of it" if loose[name] < 1 else f"{loose[name]:.2g} times as large"
             said += f", not determined: its standard error in one window is {times}"
-        typer.echo(f"{name:>20} {said}")
+        typer.echo(f"{name:>{width}} {said}")
 
 
 def _say_impedance(found: ArmImpedance) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp.identification.residuals import Residuals
 from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.joint import HumanJoint, parameter_units
@@ -121,6 +123,12 @@ class Estimates(Result):
     """Parameters that are not the same in windows that share no rows, and what they are when, in words."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
+    residuals: Residuals | None = None
+    """What the parameters of the whole recording leave of its torque, of each joint."""
+    held_out: Residuals | None = None
+    """What they leave of a recording that they have not seen, where there is one."""
+    doubted: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Of a model whose parameters are judged one by one, (M,) why each cannot be trusted; empty text where it can."""
 
     @property
     def value(self) -> NDArray[np.float64]:
@@ -158,6 +166,8 @@ class Estimates(Result):
 
     def trusted_in(self, name: str) -> NDArray[np.bool_]:
         """(M,) which windows can be trusted in one parameter: what the model lacks may spare it."""
+        if name in self.doubted:
+            return np.asarray(self.verdicts.trusted & (self.doubted[name] == ""))
         spared = name not in self.lacking and self.verdicts.rule == NOTHING_MISSING
         return np.asarray(self.verdicts.trusted | spared)
 
@@ -183,6 +193,16 @@ class Estimates(Result):
             for part in (self.model.models if isinstance(self.model, Joints) else (self.model,))
         }
         return units.pop() if len(units) == 1 else "mixed"
+
+    def on_held_out(self) -> Estimates:
+        """With the torque of the recording that was held out in place of its own, for figures."""
+        found = self.held_out
+        if found is None:
+            raise ValueError("no recording was held out: pass held_out to estimate")
+        unseen = np.full_like(found.predicted, np.nan)
+        return replace(
+            self, time=found.time, torque=found.torque, reconstructed=found.predicted, predicted=unseen, notes=()
+        )
 
     def columns(self) -> list[Column]:
         """A row for each window: as in `estimates.parquet`."""

@@ -20,10 +20,12 @@ from jaximp.identification.judging import judge
 from jaximp.identification.misfit import find_human_misfits, find_misfits
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, prepare, whitener, with_windows
+from jaximp.identification.residuals import Residuals, of_whole_recording
 from jaximp.identification.robot_changes import Doubts, Sameness
 from jaximp.identification.rows import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
+from jaximp.identification.weighted import weighted_fit
 from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
@@ -35,18 +37,20 @@ from jaximp.types import Progress, Recording, RobotAlone, nearest
 
 def estimate(
     pipeline: Pipeline,
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     alone: RobotAlone = None,
     progress: Progress = lambda share: None,
+    held_out: Recording | None = None,
 ) -> list[Estimates]:
     """Identify a recording in all windows: one `Estimates` for each method (one where there is no pair).
 
-    **Arguments:** `alone`, the recording of the robot without the human, where the pipeline has a robot; or two, one
-    before and one after that with the human.
+    **Arguments:** `recording`, or several that count as one; `alone`, the recording of the robot without the human,
+    where the pipeline has a robot; or two, one before and one after that with the human; `held_out`, one that the
+    estimates are to predict.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
     """
-    prepared = prepare(pipeline, recording, alone)
+    prepared = prepare(pipeline, recording, alone, held_out)
     progress(0.3)
     return in_windows(prepared, lambda share: progress(0.3 + 0.7 * share))
 
@@ -80,13 +84,24 @@ def in_windows(
     longest: float | None = None,
     curves: bool = True,
 ) -> list[Estimates]:
-    """Solve (where that is not done yet) and judge every window of a prepared recording, by every method.
+    """Solve (where that is not done yet) and judge every window of a prepared recording, by every method; and see what
+    they leave of the torque.
 
     **Arguments:** `longest` [s], where other lengths of up to so much follow: they will share the compiled code;
     `curves` whether the torques over time are wanted, which only figures need.
     """
     if not prepared.solved and prepared.stackable:
         prepared = solve_windows([prepared], longest=longest)[0]
+    found = _in_windows(prepared, progress, longest, curves)
+    if prepared.pair is not None or not prepared.pipeline.once or not curves:
+        return found
+    theta = of_whole_recording(prepared, found[0].value)
+    held_out = None if prepared.held_out is None else Residuals.of(prepared.held_out, theta)
+    return [replace(found[0], residuals=Residuals.of(prepared.rows, theta), held_out=held_out)]
+
+
+def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, curves: bool) -> list[Estimates]:
+    """Of windows whose sums are solved, where they can be."""
     if isinstance(prepared.model, Joints):
         return [_joint_by_joint(prepared, prepared.model, progress, longest, curves)]
     rows = prepared.rows
@@ -97,6 +112,10 @@ def in_windows(
     if prepared.pair is not None:
         return _by_methods(prepared, prepared.pair, place, progress, curves)
 
+    if prepared.weighted is not None:
+        fit = weighted_fit(rows, prepared.weighted, place)
+        misfits = _misfits(prepared, fit)
+        return [judge(prepared, rows, _predict(rows, fit, place), place, curves=curves, misfits=misfits)]
     white, ordinary = prepared.white[0] if prepared.white else None, prepared.pipeline.ordinary
     solve = partial(sliding_least_squares, window=place.window, step=place.step, room=place.given_room)
     solve = partial(solve, valid=jnp.asarray(rows.valid), noise=None if white else prepared.noise)
@@ -300,17 +319,33 @@ def _reflexes_side_by_side(parts: list[Estimates]) -> Iterator[Reflex]:
         first += len(part.names)
 
 
+OTHER_LENGTHS = (0.5, 2.0)
+"""Times its own that a window is made, so that the choice of a length can be seen."""
+
+
+def longest_of(prepared: Prepared) -> float | None:
+    """The longest of these windows [s]; none where a window is the whole recording."""
+    pipeline = prepared.pipeline
+    return None if _is_whole(prepared) else max(OTHER_LENGTHS) * pipeline.window.length
+
+
+def _is_whole(prepared: Prepared) -> bool:
+    return prepared.pipeline.window_samples == len(prepared.recording)
+
+
 def at_other_lengths(
     prepared: Prepared,
     alone: RobotAlone = None,
-    factors: tuple[float, ...] = (0.5, 2.0),
+    factors: tuple[float, ...] = OTHER_LENGTHS,
     progress: Progress = lambda share: None,
 ) -> list[Estimates]:
     """The same data with shorter and longer windows, by the first method, so that the choice of a length can be seen.
 
-    Lengths that the recording or the filters do not allow are left out.
+    Lengths that the recording or the filters do not allow are left out; a window that is the whole recording has none.
     """
     length = prepared.pipeline.window.length
+    if _is_whole(prepared):
+        return []
 
     def identified(factor: float) -> list[Estimates]:
         other = prepared.pipeline.with_window(factor * length)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaximp.identification.comparisons import by_frequency, changes, gain_in_wor
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
+from jaximp.identification.gains import with_gain_errors
 from jaximp.identification.instruments import MOVED, REMEDY, Drive, belongs_with_later_motion, in_windows_of
 from jaximp.identification.misfit import (
     Known,
@@ -42,7 +44,15 @@ from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
-from jaximp.trust.window_rules import Windows, excited_windows, judge_together, judged_names, measure_windows
+from jaximp.trust.window_rules import (
+    Windows,
+    excited_windows,
+    is_chain,
+    judge_together,
+    judge_windows,
+    judged_names,
+    measure_windows,
+)
 from jaximp.types import Numbers, Recording
 
 CLEAR = 2.0
@@ -78,12 +88,20 @@ def judge(
     of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
     of_model = of_model.with_gain(gain_in_words(model, fit, _apart(place)), judged)
     of_model = of_model.with_doubts(doubts, judged)
-    sure, fit = fit, _with_open_moves(fit, of_model.moves)
+    sure, fit = fit, with_gain_errors(prepared, rows, _with_open_moves(fit, of_model.moves), place)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
-    measured = measure_windows(fit, model.names, model.roles, full, scale, prepared.column_noise, threshold, limits)
+    measure = partial(measure_windows, fit, model.names, model.roles, full, scale, prepared.column_noise, threshold)
+    measured, doubted = measure(limits), {}
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
     measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy, at_limit=at_limit)
     measured = _against_other_people(measured, model, fit, limits)
+    if is_chain(model.roles):
+        each = {name: measure(replace(limits, parameters=(name,))) for name in model.names}
+        each = {
+            name: replace(one, tested=bool(misfits), missing=of_model.lacking.get(name, ""))
+            for name, one in each.items()
+        }
+        doubted = {name: judge_windows(one, limits).reason for name, one in each.items()}
     measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
     side_by_side = _apart(place) * np.flatnonzero(excited_windows(measured, limits)[:: _apart(place)])
     reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
@@ -123,6 +141,7 @@ def judge(
         frequencies=by_frequency(pipeline, rows, prepared.white) if misfits and curves else (),
         noise=_noise_spectra(prepared, torque - reconstructed) if curves else (),
         lacking={name: text for name, text in of_model.lacking.items() if name not in weights},
+        doubted=doubted,
     )
     of_reflexes = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
     return replace(estimates, notes=estimates.notes + of_reflexes) if of_reflexes else estimates
@@ -145,7 +164,7 @@ def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement
     inside windows do."""
     if len(prepared.white) != 1:
         return fit
-    solved = rows if prepared.pipeline.ordinary else prepared.white[0]
+    solved = (prepared.weighted or rows) if prepared.pipeline.ordinary else prepared.white[0]
     drive = prepared.drive
     if drive is not None and drive.W is not None:
         both = np.concatenate([drive.W, np.asarray(drive.torque)[:, None]], axis=1)

@@ -191,7 +191,9 @@ class Tests:
             columns, plain = np.zeros((2, *counts.shape, next(iter(by_output.values())).shape[1]))
             for j, acting in by_output.items():
                 columns[:, j] = white.apply(acting, counts[:, j], j)
-                plain[:, j] = np.where(counts[:, j, None], acting, 0)
+                plain[:, j] = np.where(counts[:, j, None], acting, 0) / (
+                    1 if white.counted is None else white.counted[j]
+                )
             whole[name], filtered[name] = (x.reshape(-1, columns.shape[-1]) for x in (columns, plain))
         W, window = W.reshape(-1, W.shape[-1]), pipeline.window_rows * outputs
         moved_in = None if white.as_filtered is None else (np.reshape(white.as_filtered, W.shape), filtered)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -12,10 +13,11 @@ from jaximp import signals
 from jaximp.identification.filter_settings import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
 from jaximp.trust.limits import TrustLimits
-from jaximp.types import AnyArray, Recording, nearest
+from jaximp.types import AnyArray, Numbers, Recording, nearest
 
 NOISE = ["estimated", "filtered"]
 """Choices of `WindowSettings.noise`."""
@@ -31,18 +33,22 @@ ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 class WindowSettings:
     """Windows and the samples that count in them."""
 
-    length: float
-    """Length of the sliding window [s]."""
+    length: float = math.inf
+    """Length of the sliding window [s]. `"all"` takes the whole recording as one window, which is the default for
+    robots from a URDF; others need a length."""
     step: float | None = None
     """From one window to the next [s]; by default a fiftieth of the length."""
     noise: str = "estimated"
     """Of the torque: `estimated` from what windows leave of it, whatever its colour; `filtered` takes it as white
     before the filters, for ordinary least squares as in the paper."""
-    estimates: str = "generalised"
+    estimates: str | None = None
     """How noise that is estimated is used. `generalised` least squares count every frequency as much as its noise
-    allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise."""
+    allows; `ordinary` ones count the torque as it was filtered, with standard errors that know the noise. By default
+    generalised, and ordinary for robots from a URDF, whose models leave more than noise: their joints are weighed by
+    what is left of each."""
     min_velocity: float = 0.0
-    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says."""
+    """Samples that move slower are left out [rad/s or m/s]: near standstill dry friction is not what the model says.
+    Of several joints only the rows of those that are slow."""
 
     @property
     def step_seconds(self) -> float:
@@ -61,7 +67,7 @@ class Pipeline:
     """Of the recordings [Hz]."""
     model: Model
     """What is identified in the windows."""
-    window: WindowSettings
+    window: WindowSettings = field(default_factory=WindowSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
     limits: TrustLimits = field(default_factory=TrustLimits)
     robot: Model | None = None
@@ -83,6 +89,11 @@ class Pipeline:
         return design_filters(self.filter, self.sample_rate)
 
     @property
+    def gap(self) -> int:
+        """Samples between recordings that count as one."""
+        return gap_between(self.filters)
+
+    @property
     def once(self) -> bool:
         """Whether the filters run over the recording once, and not inside every window."""
         return self.filter.mode == "once"
@@ -95,7 +106,28 @@ class Pipeline:
     @property
     def ordinary(self) -> bool:
         """Whether the noise is estimated, but only the standard errors of ordinary least squares use it."""
-        return self.whitens and self.window.estimates == "ordinary"
+        usual = ESTIMATES[1] if isinstance(self.model, Chain) else ESTIMATES[0]
+        return self.whitens and (self.window.estimates or usual) == "ordinary"
+
+    @property
+    def weighs(self) -> bool:
+        """Whether ordinary least squares of several joints weigh each by what is left of it."""
+        return self.ordinary and isinstance(self.model, Chain) and self.model.n_joints > 1
+
+    @property
+    def min_velocity(self) -> Numbers:
+        """() or (n,): slower rows of a joint do not count [rad/s or m/s]."""
+        of_model = self.model.min_velocity if isinstance(self.model, Chain) else 0.0
+        return np.asarray(np.maximum(self.window.min_velocity, of_model))
+
+    @property
+    def whole(self) -> bool:
+        """Whether a recording is one window."""
+        return math.isinf(self.window.length)
+
+    def of_length(self, samples: int) -> Pipeline:
+        """With the window of a recording of so many samples, where it is the whole recording."""
+        return self.with_window(samples / self.sample_rate, samples / self.sample_rate) if self.whole else self
 
     @property
     def window_samples(self) -> int:
@@ -126,6 +158,11 @@ class Pipeline:
         """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees, and for
         filters that its sample rate does not allow."""
         require_float64(recording.position)
+        if isinstance(self.model, Chain) and self.model.n_joints != recording.n_joints:
+            raise ValueError(
+                f"{self.model.robot} has {self.model.n_joints} joints, but the recording {recording.n_joints}: map a "
+                "column of position and torque for each, or lock the others"
+            )
         duration = len(recording) / recording.sample_rate
         if round(self.window.length * recording.sample_rate) > len(recording):
             raise ValueError(
@@ -140,7 +177,8 @@ class Pipeline:
             )
         if self.window.noise not in NOISE:
             raise ValueError(f"window.noise is '{self.window.noise}': {nearest(self.window.noise, NOISE)}")
-        if self.window.estimates not in ESTIMATES:
+        if self.window.estimates not in (None, *ESTIMATES):
+            assert self.window.estimates is not None
             hint = nearest(self.window.estimates, ESTIMATES)
             raise ValueError(f"window.estimates is '{self.window.estimates}': {hint}")
         if self.drive is not None and self.drive not in DRIVES:
@@ -183,6 +221,11 @@ class Pipeline:
         if len(reference) < round(self.reference * rate) or not np.isfinite(reference).all():
             return "the reference position does not cover one period, so the threshold (eq. 16) is not applied"
         return reference, *signals.differentiate(reference, rate, self.filters.differentiator)
+
+
+def gap_between(filters: Filters) -> int:
+    """Samples between recordings that count as one: what one of them does to the filters has died out by then."""
+    return 2 * filters.reach
 
 
 def _check_elbow(recording: Recording) -> None:

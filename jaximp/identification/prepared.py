@@ -27,10 +27,12 @@ from jaximp.identification.robot_changes import (
 from jaximp.identification.rows import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
+from jaximp.identification.weighted import by_size, sizes_of_joints
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model, combine
 from jaximp.recordings.delays import moved_forward
+from jaximp.recordings.join import join_recordings
 from jaximp.types import Recording, RobotAlone
 
 CLEARLY_MORE = 1.5
@@ -79,6 +81,10 @@ class Prepared:
     """What is known of what moves each joint (of joints side by side), where something is."""
     explained: Recording | None = None
     """With the part of the motion that a reference explains, where the rows are those of this part."""
+    weighted: Rows | None = None
+    """In units of what is left of each joint, where joints are weighed (`Pipeline.weighs`)."""
+    held_out: Rows | None = None
+    """Of a recording that the estimates are to predict."""
 
     @property
     def drive(self) -> Drive | None:
@@ -98,7 +104,7 @@ class Prepared:
     @property
     def stackable(self) -> bool:
         """Whether all its windows are solved in one call, by sums that they share."""
-        return can_be_stacked(self.pipeline) and len(self.rows.time) <= MOST_ROWS
+        return can_be_stacked(self.pipeline) and self.weighted is None and len(self.rows.time) <= MOST_ROWS
 
 
 def can_be_stacked(pipeline: Pipeline) -> bool:
@@ -119,8 +125,26 @@ def noise_of(pipeline: Pipeline) -> Array | NDArray[np.float64] | None:
     return noise_in_windows(pipeline)
 
 
-def prepare(pipeline: Pipeline, recording: Recording, alone: RobotAlone = None) -> Prepared:
-    """Filter a recording, and that of the robot alone (or both of them) where there is a pair."""
+def prepare(
+    pipeline: Pipeline,
+    recording: Recording | Sequence[Recording],
+    alone: RobotAlone = None,
+    held_out: Recording | None = None,
+) -> Prepared:
+    """Filter a recording, and that of the robot alone (or both of them) where there is a pair.
+
+    Several recordings are one, in which no filter crosses from one into the next. `held_out` is one that the estimates
+    are to predict.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    if held_out is not None:
+        check_held_out(pipeline, recording, held_out)
+        rows = regress(measure(pipeline, without_unknown_delay(pipeline, held_out)))[0]
+        return replace(prepare(pipeline, recording, alone), held_out=rows)
+    if not isinstance(recording, Recording):
+        recording = join_recordings(recording, pipeline.gap)
+    pipeline = pipeline.of_length(len(recording))
     recording = without_unknown_delay(pipeline, recording)
     if pipeline.robot is not None:
         given = () if alone is None else alone if isinstance(alone, tuple) else (alone,)
@@ -131,6 +155,22 @@ def prepare(pipeline: Pipeline, recording: Recording, alone: RobotAlone = None) 
     if pipeline.once:
         return _prepared(measured, *regress(measured))
     return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
+
+
+def check_held_out(pipeline: Pipeline, recording: Recording | Sequence[Recording], held_out: Recording) -> None:
+    """Refuse a recording that the estimates of another one cannot predict."""
+    if pipeline.robot is not None or not pipeline.once:
+        raise ValueError(
+            "a recording can be held out of one model alone, with filter.mode = 'once': leave held_out out"
+        )
+    first = recording if isinstance(recording, Recording) else recording[0]
+    if held_out.joints != first.joints:
+        raise ValueError(f"{held_out.name}, which is held out, has other joints than {first.name}: map the same ones")
+    if abs(held_out.sample_rate - pipeline.sample_rate) > 1e-3 * pipeline.sample_rate:
+        raise ValueError(
+            f"{held_out.name}, which is held out, was sampled at {held_out.sample_rate:g} Hz and {first.name} at "
+            f"{pipeline.sample_rate:g} Hz: resample one of them"
+        )
 
 
 def without_unknown_delay(pipeline: Pipeline, recording: Recording) -> Recording:
@@ -166,7 +206,8 @@ def share_of_stack(measured: Measured, found: Filtered, k: int) -> Prepared:
 def with_windows(prepared: Prepared, pipeline: Pipeline) -> Prepared:
     """The same rows for windows of another length, whose noise is estimated from what they leave."""
     white = tuple(whitened(pipeline, prepared.rows)) if prepared.white else ()
-    return replace(prepared, pipeline=pipeline, white=white, solved=())
+    other = replace(prepared, pipeline=pipeline, white=white, solved=())
+    return _weighted(other) if pipeline.weighs else other
 
 
 def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:
@@ -255,9 +296,22 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
         white = (replace(one, noisy=more * np.asarray(one.noisy)),)
     if white and not pipeline.ordinary:
         noise = np.concatenate([one.column_noise for one in white])
-    return Prepared(
+    prepared = Prepared(
         recording, pipeline, rows, noise, pair, reference, measured.jumps, white, drives=drives, explained=explained
     )
+    return _weighted(prepared) if pipeline.weighs else prepared
+
+
+def _weighted(prepared: Prepared) -> Prepared:
+    """With rows in which each joint counts by what is left of it."""
+    rows, white = prepared.rows, prepared.white[0]
+    size = sizes_of_joints(rows)
+    weighted = by_size(rows, size)
+    columns = np.where(np.asarray(rows.valid)[..., None], weighted.W, 0)
+    assert weighted.noisy is not None
+    noise = np.sqrt((weighted.noisy.reshape(-1, columns.shape[-1]) ** 2).mean(axis=0))
+    white = replace(white, as_filtered=columns, counted=size)
+    return replace(prepared, weighted=weighted, white=(white,), column_noise=noise)
 
 
 def _noise_in_band(rows: Rows, white: tuple[White, ...]) -> float:

@@ -55,6 +55,8 @@ class Rows:
     noisy: AnyArray | None = None
     """(N, *n, p) what noise of the position leaves in every column; None for the rows of windows that were filtered one
     by one."""
+    clean: NDArray[np.bool_] | None = None
+    """(N,) whose filtered values come from measurements; those that count also move. None where nobody asked."""
 
     def of_joint(self, j: int, columns: slice) -> Rows:
         """The share of one joint, whose parameters stand in these columns."""
@@ -173,7 +175,7 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
     decimate = pipeline.filters.decimate
     n = -(-len(recording) // decimate)
     W, y, speed = (x[k][:n] for x in (found.W, found.y, found.speed))
-    clean, moving = measured.clean[::decimate], speed >= pipeline.window.min_velocity
+    clean, moving = measured.clean[::decimate], speed >= pipeline.min_velocity
     valid = clean & moving if recording.n_joints == 1 else clean[:, None] & moving
     if not valid.any():
         found_before = "".join(f"; {fault.text}" for fault in recording.faults)
@@ -183,7 +185,7 @@ def rows_of(measured: Measured, found: Filtered, k: int) -> tuple[Rows, NDArray[
             f"window.min_velocity{found_before}"
         )
     noisy, level = _noise_of(measured, found, k)
-    return Rows(W, y, valid, recording.time[::decimate], noisy), level
+    return Rows(W, y, valid, recording.time[::decimate], noisy, clean), level
 
 
 def _noise_of(measured: Measured, found: Filtered, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -290,7 +292,7 @@ def _columns_of(
         W = W.at[: model.memory].set(jnp.nan_to_num(W[: model.memory]))
     y = jnp.asarray(torque)[:, 0] if one_joint else jnp.asarray(torque)
     both = parallel(jnp.concatenate([W, y[..., None]], axis=-1))
-    return both[::decimate, ..., :-1], both[::decimate, ..., -1], jnp.abs(motion[1])[::decimate]
+    return both[::decimate, ..., :-1], both[::decimate, ..., -1], model.speed(motion[1])[::decimate]
 
 
 # --- programs that several threads and devices share ------------------------------------------------------------------

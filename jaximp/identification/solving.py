@@ -44,6 +44,9 @@ MOST_EMPTY = 4
 """So many times the rows that there are, sums that windows share may look at."""
 CALL = 4
 """What a call of a program costs, in recordings."""
+MOST_UNROLLED = 16
+"""Parameters up to which windows are solved by sums that they share: those are written out term by term, so that
+compiling takes ever longer. Each window of a larger model is decomposed by itself."""
 LAGS_GRAIN = 16
 """Lags of the noise's autocovariance are filled up with zeros to a multiple: rates that are alike share a program."""
 
@@ -148,12 +151,12 @@ class Layout(NamedTuple):
     """Whether the rows as they were filtered are held against others, and not the white ones."""
 
 
-def make_layout(rows: int, outputs: int, place: Placement, lags: int) -> Layout:
+def make_layout(rows: int, outputs: int, place: Placement, lags: int, parameters: int = 0) -> Layout:
     """The program for so many padded rows, and windows of up to `place.room` rows."""
     window, step = place.window * outputs, place.step * outputs
     lags = -(-lags // LAGS_GRAIN) * LAGS_GRAIN
     reach = (lags - 1) * outputs
-    if lags and (reach > LONGEST_REACH or 2 * reach > window):
+    if parameters > MOST_UNROLLED or (lags and (reach > LONGEST_REACH or 2 * reach > window)):
         return Layout(None, place.window, place.step, lags)
     per_block = max(1, min(BLOCK // step, window // step))
     shortest = 1 if place.lengths else place.window
@@ -200,7 +203,7 @@ def solve_stack(several: Sequence[Task], place: Placement, padded: int, stacked:
     first = several[0]
     lags = max((0 if one.noise is None else len(one.noise)) for one in several)
     outputs = int(np.prod(first.rows.torque.shape[1:]))
-    layout = make_layout(padded, outputs, place, lags)._replace(ordinary=_ordinary(first.white))
+    layout = make_layout(padded, outputs, place, lags, first.rows.W.shape[-1])._replace(ordinary=_ordinary(first.white))
     stack = _stacked(several, place, layout, padded, stacked)
     with first_call("solve", layout, *(x.shape for x in jax.tree.leaves(stack))):
         found = jax.tree.map(np.asarray, _program(layout, stack))

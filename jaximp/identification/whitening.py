@@ -62,6 +62,8 @@ class White:
     """(p,) by what standard errors grow since the noise's size follows the motion; one where it does not."""
     as_filtered: AnyArray | None = None
     """(N, *n, p) columns of the rows as they were filtered, where estimates come from these (`Pipeline.ordinary`)."""
+    counted: Numbers | None = None
+    """(n,) what these are divided by, where joints are weighed."""
 
     @property
     def every(self) -> int:

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from jaximp.design.files import read_trajectory
-from jaximp.identification.filter_settings import FilterSettings
-from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings
+from jaximp.identification.filter_settings import FilterSettings, design_filters
+from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings, gap_between
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
+from jaximp.jobs.chain import ChainSettings
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import TrialsSettings, trials_settings
 from jaximp.models.base import Joints, Model
@@ -26,7 +27,8 @@ from jaximp.models.reflex import ReflexPathway
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
-from jaximp.recordings.load import recording_from_mapping
+from jaximp.recordings.join import join_recordings, part_of
+from jaximp.recordings.load import recording_from_mapping, recordings_from_mapping
 from jaximp.trust import plausibility
 from jaximp.trust.limits import TrustLimits
 from jaximp.types import Recording, RobotAlone, nearest
@@ -114,6 +116,8 @@ class ModelSettings:
     robot: RobotSettings | None = None
     arm: ArmSettings | None = None
     """Whose joints were recorded."""
+    chain: ChainSettings | None = None
+    """The robot, where its table names a URDF."""
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
     beside it."""
@@ -133,11 +137,16 @@ class WindowJob:
     """Everything that is to be known of a recording, which is identified window by window."""
 
     recording: Mapping[str, Any]
-    """The `[recording]` table: keywords of `load_recording`, and `file`."""
+    """The `[recording]` table: keywords of `load_recording`, and `file`, which may be a list."""
     model: ModelSettings
     window: WindowSettings
     filter: FilterSettings = field(default_factory=FilterSettings)
     trust: TrustLimits = field(default_factory=TrustLimits)
+    more_recordings: tuple[Mapping[str, Any], ...] = ()
+    """The second and later of several `[[recording]]` tables, which count as one recording with the first."""
+    held_out: Mapping[str, Any] | float | None = None
+    """A recording that the estimates must predict without having seen it: a table as `[recording]`, whose columns are
+    those of `[recording]` where it names none; or the share of the recording at its end that is kept back."""
     robot_recording: Mapping[str, Any] | None = None
     """The recording of the robot alone, for the four methods."""
     robot_recording_after: Mapping[str, Any] | None = None
@@ -157,7 +166,22 @@ class WindowJob:
 
         **Raises:** as `load_recording`.
         """
-        return recording_from_mapping(self.recording, self.folder)
+        whole = self._joined([self.recording, *self.more_recordings])
+        return part_of(whole, 0.0, 1 - self.held_out) if isinstance(self.held_out, float) else whole
+
+    def load_held_out(self) -> Recording | None:
+        """The recording that is to be predicted, where the job has one."""
+        if self.held_out is None:
+            return None
+        if isinstance(self.held_out, float):
+            return part_of(self._joined([self.recording, *self.more_recordings]), 1 - self.held_out, 1.0)
+        columns = {key: value for key, value in self.recording.items() if key not in ("file", "rows", "name")}
+        return self._joined([{**columns, **self.held_out}])
+
+    def _joined(self, tables: list[Mapping[str, Any]]) -> Recording:
+        """All recordings of some tables as one, in which the filters do not cross from one into the next."""
+        several = [one for table in tables for one in recordings_from_mapping(table, self.folder)]
+        return join_recordings(several, gap_between(design_filters(self.filter, several[0].sample_rate)))
 
     def load_robot_alone(self) -> RobotAlone:
         """The recording of the robot alone, where the job has one; both of them where it has two."""
@@ -174,15 +198,23 @@ class WindowJob:
 
     def files(self) -> list[Path]:
         """What the job reads."""
-        tables = (self.recording, self.robot_recording or {}, self.robot_recording_after or {})
-        names = [str(table["file"]) for table in tables if "file" in table]
-        return [self.folder / name for name in (*names, self.design) if name is not None]
+        held_out = self.held_out if isinstance(self.held_out, Mapping) else None
+        others = (held_out, self.robot_recording, self.robot_recording_after)
+        tables = [self.recording, *self.more_recordings, *(table for table in others if table is not None)]
+        named = [table["file"] for table in tables if "file" in table]
+        names = [str(name) for one in named for name in (one if isinstance(one, list) else [one])]
+        urdf = None if self.model.chain is None else self.model.chain.urdf
+        return [self.folder / name for name in (*names, self.design, urdf) if name is not None]
 
     def models(self, joints: tuple[str, ...], sample_rate: float | None = None) -> tuple[Model | None, Model | None]:
         """Robot and human model for a recording with these joints; several joints stand side by side. An arm, which is
         one model of two joints, stands in the robot's place. A human with a reflex needs the `sample_rate` [Hz]."""
         robot, human = self.model.robot, self.model.human
         human = None if human is None else replace(human, joint_name=None)
+        if self.model.chain is not None:
+            chain = self.model.chain.make(self.folder)
+            self.model.chain.check(chain, joints)
+            return chain, None
         if self.model.arm is not None:
             if joints != ("revolute", "revolute"):
                 raise ValueError(
@@ -221,7 +253,7 @@ class WindowJob:
 
     def pipeline_for(self, recording: Recording) -> Pipeline:
         """What is done with this recording."""
-        return self.pipeline(recording.joints, recording.sample_rate)
+        return self.pipeline(recording.joints, recording.sample_rate).of_length(len(recording))
 
 
 @dataclass(frozen=True)
@@ -276,22 +308,30 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
     recordings = ["recording", "robot_recording", "robot_recording_after"]
-    known = [*recordings, "model", "window", "filter", "trust", "reference_period", "design"]
+    known = [*recordings, "held_out", "model", "window", "filter", "trust", "reference_period", "design"]
     check_keys(tables, [*known, "posterior", "trials"], "the job")
     if "trials" in tables:
         return _job_of_trials(tables, folder, text)
-    for required in ("recording", "model", "window"):
+    for required in ("recording", "model"):
         if required not in tables:
             raise ValueError(f"the job has no [{required}] table: add one")
-    for table in recordings:
-        if table in tables and not isinstance(tables[table], dict):
-            raise ValueError(f"[{table}] must be a table")
+    several = tables["recording"] if isinstance(tables["recording"], list) else [tables["recording"]]
+    for name, table in [("recording", one) for one in several] + [
+        (name, tables.get(name, {})) for name in recordings[1:]
+    ]:
+        if not isinstance(table, dict):
+            raise ValueError(f"[{name}] must be a table")
+    model = model_settings(tables["model"])
+    if "window" not in tables and model.chain is None:
+        raise ValueError("the job has no [window] table: add one")
     job = WindowJob(
-        recording=tables["recording"],
+        recording=several[0],
+        more_recordings=tuple(several[1:]),
+        held_out=_held_out(tables.get("held_out")),
         robot_recording=tables.get("robot_recording"),
         robot_recording_after=tables.get("robot_recording_after"),
-        model=model_settings(tables["model"]),
-        window=settings(WindowSettings, tables["window"], "window"),
+        model=model,
+        window=_window(tables.get("window", {}), model),
         filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
         trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
         reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
@@ -302,6 +342,28 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     )
     _check_values(job)
     return job
+
+
+def _window(table: Any, model: ModelSettings) -> WindowSettings:
+    """`[window]`, whose length may be `"all"`."""
+    given = table.get("length") if isinstance(table, dict) else None
+    if given == math.inf:
+        raise ValueError("window.length is inf: it must be a number above zero, or 'all'")
+    if given == "all":
+        return settings(WindowSettings, {**table, "length": math.inf}, "window")
+    window = settings(WindowSettings, table, "window")
+    if given is None and model.chain is None:
+        raise ValueError("[window] has no 'length': add it")
+    return window
+
+
+def _held_out(value: Any) -> Mapping[str, Any] | float | None:
+    if value is None or isinstance(value, dict):
+        return value
+    share = checked(value, float, "held_out")
+    if not 0 < share < 1:
+        raise ValueError(f"held_out is {share:g}: it is the share of the recording that is kept back, such as 0.2")
+    return float(share)
 
 
 def _job_of_trials(tables: dict[str, Any], folder: Path, text: str) -> TrialsJob:
@@ -347,7 +409,8 @@ def model_settings(table: Any) -> ModelSettings:
     if not isinstance(table, dict):
         raise ValueError("[model] must be a table")
     check_keys(table, ["human", "robot", "arm", "methods", "drive", "robot_drift"], "[model]")
-    robot = optional(RobotSettings, table.get("robot", False), "model.robot")
+    chain = _chain(table)
+    robot = None if chain else optional(RobotSettings, table.get("robot", False), "model.robot")
     human = optional(HumanSettings, table.get("human", False), "model.human")
     arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])
     if arm is not None:
@@ -363,7 +426,18 @@ def model_settings(table: Any) -> ModelSettings:
     if drive is not None and drive not in DRIVES:
         raise ValueError(f"model.drive is {drive!r}: {nearest(str(drive), DRIVES)}")
     drift = _robot_drift(table.get("robot_drift"), human, robot)
-    return ModelSettings(human, robot, arm, tuple(dict.fromkeys(methods)), drive, drift)
+    return ModelSettings(human, robot, arm, chain, tuple(dict.fromkeys(methods)), drive, drift)
+
+
+def _chain(table: Mapping[str, Any]) -> ChainSettings | None:
+    """The robot, where its table names a URDF."""
+    robot = table.get("robot")
+    if not (isinstance(robot, dict) and "urdf" in robot):
+        return None
+    for other in ("human", "arm", "methods"):
+        if table.get(other, False) is not False:
+            raise ValueError(f"model.robot from a URDF stands alone: leave out model.{other}")
+    return settings(ChainSettings, robot, "model.robot")
 
 
 def _robot_drift(
@@ -382,7 +456,7 @@ def _robot_drift(
 
 
 def _check_values(job: WindowJob) -> None:
-    if job.model.human is None and job.model.robot is None and job.model.arm is None:
+    if all(part is None for part in (job.model.human, job.model.robot, job.model.arm, job.model.chain)):
         raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
     both = job.model.human is not None and job.model.robot is not None
     if both and job.robot_recording is None:
@@ -410,7 +484,7 @@ def _check_values(job: WindowJob) -> None:
         "reference_period": job.reference_period,
     }
     for name, value in positive.items():
-        if value is not None and not (value > 0 and math.isfinite(value)):
+        if value is not None and not (value > 0 and (math.isfinite(value) or name == "window.length")):
             raise ValueError(f"{name} is {value}: it must be a number above zero")
     if not (job.window.min_velocity >= 0 and math.isfinite(job.window.min_velocity)):
         raise ValueError(f"window.min_velocity is {job.window.min_velocity}: it must be zero or more")
@@ -421,7 +495,7 @@ def _check_values(job: WindowJob) -> None:
     for name in ("position_order", "decimation_order", "high_pass_order"):
         if not 1 <= getattr(job.filter, name) <= 12:
             raise ValueError(f"filter.{name} is {getattr(job.filter, name)}: it must lie between 1 and 12")
-    offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm) if part is not None]
+    offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm, job.model.chain) if part]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
 

@@ -24,21 +24,27 @@ def identify(job: Job, progress: Progress = lambda share: None) -> list[Estimate
     """
     if isinstance(job, TrialsJob):
         return identify_trials(job, progress)
-    return identify_recording(job, job.load(), job.load_robot_alone(), progress)
+    return identify_recording(job, job.load(), job.load_robot_alone(), progress, job.load_held_out())
 
 
 def identify_recording(
-    job: WindowJob, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
+    job: WindowJob,
+    recording: Recording,
+    alone: RobotAlone = None,
+    progress: Progress = lambda share: None,
+    held_out: Recording | None = None,
 ) -> list[Estimates]:
     """As `identify`, for recordings that are in memory; `alone` may be two, before and after the human's."""
-    return estimate(job.pipeline_for(recording), recording, alone, progress)
+    return estimate(job.pipeline_for(recording), recording, alone, progress, held_out)
 
 
-def prepare(job: WindowJob, recording: Recording | None = None, alone: RobotAlone = None) -> Prepared:
+def prepare(
+    job: WindowJob, recording: Recording | None = None, alone: RobotAlone = None, held_out: Recording | None = None
+) -> Prepared:
     """Read the recordings of a job (or take these) and filter them: rows for least squares, windows still to come."""
     if recording is None:
-        recording, alone = job.load(), job.load_robot_alone()
-    return prepare_recording(job.pipeline_for(recording), recording, alone)
+        recording, alone, held_out = job.load(), job.load_robot_alone(), job.load_held_out()
+    return prepare_recording(job.pipeline_for(recording), recording, alone, held_out)
 
 
 def check(

@@ -56,6 +56,9 @@ def checked(value: Any, hint: Any, where: str) -> Any:
     for choice in choices:
         if typing.get_origin(choice) is list and isinstance(value, list):
             return [checked(item, typing.get_args(choice)[0], where) for item in value]
+        if typing.get_origin(choice) is dict and isinstance(value, dict):
+            kind = typing.get_args(choice)[1]
+            return {key: checked(item, kind, f"{where}.{key}") for key, item in value.items()}
         if is_dataclass(choice) and isinstance(value, dict):
             return settings(typing.cast(type, choice), value, where)
         if type(value) is choice:
@@ -66,6 +69,7 @@ def checked(value: Any, hint: Any, where: str) -> Any:
         float: "a number",
         list[float]: "a list of numbers",
         list[str]: "a list of text",
+        dict[str, float]: "a table of numbers",
         int: "a whole number",
         bool: "true or false",
         str: "text",

@@ -125,6 +125,10 @@ class Model(eqx.Module):
         motion = (jnp.concatenate([jnp.asarray(x)] * periods) for x in (q, dq, ddq))
         return model.observation_matrix(*motion)[-n:]
 
+    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
+        """How fast what makes the friction of each joint moves, for joints that move at `dq`."""
+        return jnp.abs(jnp.asarray(dq))
+
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         """The model with signs of the velocity that change gradually, within some `width` [rad/s or m/s] of zero."""
         return self

@@ -218,6 +218,12 @@ class Chain(Model):
         widths = jnp.broadcast_to(jnp.asarray(width), (self.n_joints,))
         return eqx.tree_at(lambda chain: chain.width, self, widths, is_leaf=lambda x: x is None)
 
+    def with_sign_width(self, width: PerJoint) -> Chain:
+        """The same with signs that change gradually around zero, by a hyperbolic tangent of this width; jumps where it
+        is zero."""
+        given = _per_joint("sign_width", width, 0.0, self.joint_names, np.greater_equal, "zero or more")
+        return eqx.tree_at(lambda chain: chain.width, self, jnp.asarray(given), is_leaf=lambda x: x is None)
+
     def with_stribeck(self, velocity: Num[ArrayLike, "*n"], exponent: Num[ArrayLike, "*n"]) -> Chain:
         """The same with another Stribeck curve; the regressor is differentiable in both numbers."""
         curve = tuple(jnp.broadcast_to(jnp.asarray(x, float), (self.n_joints,)) for x in (velocity, exponent))
@@ -225,7 +231,12 @@ class Chain(Model):
 
     def moving(self, dq: Num[ArrayLike, "... n"]) -> Array:
         """(..., n) whether each joint's motor is at least at `min_velocity`, so that its row counts for friction."""
-        return jnp.abs(jnp.asarray(dq) @ jnp.asarray(self.motors).T) >= jnp.asarray(self.min_velocity)
+        return self.speed(dq) >= jnp.asarray(self.min_velocity)
+
+    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
+        """Of the motors."""
+        motors, dq = jnp.asarray(self.motors), jnp.asarray(dq)
+        return jnp.abs(dq @ motors.T if self.n_joints > 1 else dq * motors[0, 0])
 
     def joint_positions(self, q: Num[ArrayLike, "... n"]) -> Float[Array, "... n_b"]:
         """Positions of all joints that move, as the URDF means them, from the recorded ones."""
@@ -342,7 +353,7 @@ def _columns(
     """(p, n, N) of the standard columns that are kept, for motions (n, N) and a Stribeck `curve`."""
     n, rigid = chain.n_joints, rigid_body.regressor_columns(tree, q, dq, ddq, xp)
     speed, change = chain.motors @ dq, chain.motors @ ddq
-    sign = xp.sign(speed) if chain.width is None else xp.tanh(speed / chain.width[:, None])
+    sign = xp.sign(speed) if chain.width is None else _gradual_sign(speed, chain.width[:, None], xp)
     at = Speed(speed, sign, (curve[0][:, None], curve[1][:, None]), xp)
     values = [change] * chain.rotor + [term.value(at) for term in chain.terms]
     # Column k of `motors`' transpose is what the torque of motor k does to the coordinates.
@@ -356,6 +367,11 @@ def _columns(
         return share[joint][:, None] * value[joint]
 
     return xp.stack([column(k) for k in kept])
+
+
+def _gradual_sign(speed: AnyArray, width: AnyArray, xp: ModuleType) -> AnyArray:
+    """Within the width of zero; it jumps where that is zero."""
+    return xp.where(width > 0, xp.tanh(speed / xp.where(width > 0, width, 1)), xp.sign(speed))
 
 
 def _per_joint(

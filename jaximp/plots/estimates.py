@@ -135,14 +135,18 @@ def torque(estimates: Estimates) -> Figure:
 def residual_spectrum(estimates: Estimates) -> Figure:
     """Power spectral density (Welch) of the torque and of the residual, on the longest stretch without a gap."""
     n_joints = estimates.torque.shape[1]
-    figure = Figure(figsize=(WIDTH, 2.8))
-    panels = figure.subplots(1, n_joints, squeeze=False)[0]
-    for joint, panel in enumerate(panels):
+    columns = min(n_joints, 2)
+    rows = -(-n_joints // columns)
+    figure = Figure(figsize=(WIDTH, 2.8 * rows))
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel in panels[n_joints:]:
+        panel.set_visible(False)
+    for joint, panel in enumerate(panels[:n_joints]):
         unit = effort(estimates, joint)[1]
         whose = f"joint {joint + 1}: " if n_joints > 1 else ""
         panel.set(xlabel="frequency (Hz)", ylabel=f"{whose}power spectral density\n[({unit})²/Hz]")
         _spectra(panel, estimates, joint)
-    _legend(figure, max(panels, key=lambda panel: len(panel.get_lines())), [])
+    _legend(figure, max(panels[:n_joints], key=lambda panel: len(panel.get_lines())), [])
     return figure
 
 

@@ -38,7 +38,7 @@ def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...],
     if clipped is not None:  # whoever reads what is saved of this recording must find the limits again
         when = time[clipped] + (signals["torque"].delay or 0.0)
         channels["torque"][clipped] = np.stack([np.interp(when, stamps, x) for x in signals["torque"].values.T], axis=1)
-    stated = signals["position"].noise
+    stated, gains = signals["position"].noise, signals["torque"].gain_covariance
     return Recording(
         time=_frozen(time),
         valid=_frozen(valid),
@@ -47,6 +47,7 @@ def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...],
         position_noise=_frozen(judged.position_noise),
         stated_noise=None if stated is None else _frozen(np.full(len(joints), stated)),
         delay_unknown=signals["torque"].delay is None,
+        gain_covariance=None if gains is None else _frozen(gains),
         clipped=None if clipped is None else _frozen(clipped),
         name=name,
         notes=(*of_sampling, *notes, *(fault.text for fault in judged.faults)),

@@ -25,11 +25,13 @@ class Signal:
     """How late it was recorded [s]; None where that is to be estimated."""
     noise: float | None = None
     """Standard deviation of the sensor's error, where it is stated."""
+    gain_covariance: NDArray[np.float64] | None = None
+    """(k, k) of the relative errors of the gains that made the columns, where these are stated."""
 
 
-def stack(columns: Sequence[str], values: Mapping[str, Any]) -> Signal:
+def stack(columns: Sequence[str | int], values: Mapping[Any, Any]) -> Signal:
     """The columns of one channel side by side; a 2-D variable brings one column per joint."""
-    parts = [(column, _as_columns(column, values[column])) for column in columns]
+    parts = [(str(column), _as_columns(str(column), values[column])) for column in columns]
     check_lengths(parts)
     labels = [
         column if part.shape[1] == 1 else f"{column}[{i + 1}]" for column, part in parts for i in range(part.shape[1])

@@ -43,6 +43,7 @@ def load_recording(
     joint: str | Sequence[str] = "revolute",
     gear_ratio: float = 1.0,
     name: str | None = None,
+    rows: Sequence[int] | None = None,
 ) -> Recording:
     """Read a recording; the keywords are the keys of a job file's `[recording]` table.
 
@@ -50,20 +51,25 @@ def load_recording(
 
     - `path`: .csv, .txt or .tsv (comma, semicolon or tab), .parquet, .mat (v5 or v7.3), .h5, .hdf5 or .npz. A column
       is a header's name, a variable (`data.q` inside a MATLAB struct) or a dataset's path; MATLAB, HDF5 and NPZ
-      variables may be (N, n), one column per joint.
+      variables may be (N, n), one column per joint. In text files a column may also be a number that counts from 1:
+      a file whose first line holds numbers alone has no header, and only numbers.
     - `time` [s] (a column, or `{column, unit}`) or else `sample_rate`: a number [Hz], or a scalar variable in the file.
     - `position`, `torque`, `velocity`, `acceleration`, `force`, `reference`, `command`: a column, a list of columns
-      (one per joint), or `{column = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, that of the channel:
-      rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N; `reference` is a position, `command` (the
-      perturbation) a torque. A bare `gain` multiplies the column and `unit` is that of the product; with
+      (one per joint), or `{columns = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, that of the
+      channel: rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N; `reference` is a position, `command`
+      (the perturbation) a torque. A bare `gain` multiplies the column and `unit` is that of the product; with
       `gain = "35.1507 N/V"`, `unit` is that of the column. `delay` [s] says how late a channel was recorded, by a
       filter or another clock: it is moved forward by so much. That of the torque behind the position may be "estimate":
       the model finds it. `noise`, of the position alone and in its unit, is the standard deviation of its sensor, which
-      samples that a recorder filtered do not show; estimates are corrected for it.
+      samples that a recorder filtered do not show; estimates are corrected for it. `gain` may be a list with one for
+      each column, such as the torques that drives give for their currents. `gain_error`, of the torque alone, is what
+      is not known of the gains, as standard deviations in per cent: `3` for each by itself, or
+      `{common = 10, each = 3}` with what all have in common; standard errors grow by it.
     - `joint`: `revolute` or `prismatic`, or a list of these, one per joint.
     - `gear_ratio`: motor turns per joint turn, if the columns were measured at the motor: position, velocity,
       acceleration and reference are divided by it, torque and command are multiplied; `force` acts at the endpoint and
       stays.
+    - `rows`: the first and the last row of the file that count, from 1 (a header is none), both included.
 
     **Returns:** the recording on a uniform grid; see `recording_from_arrays` for sampling, gaps and NaN.
 
@@ -73,7 +79,7 @@ def load_recording(
     entries |= {"acceleration": acceleration, "reference": reference, "command": command, "time": time}
     path = _existing(path)
     with _named(str(path)):
-        signals, joints = _read_signals(path, entries, sample_rate, joint, gear_ratio)
+        signals, joints = _read_signals(path, entries, sample_rate, joint, gear_ratio, rows)
         return assemble(take_clock(signals, sample_rate), signals, joints, path.stem if name is None else name)
 
 
@@ -84,12 +90,28 @@ def recording_from_mapping(table: Mapping[str, Any], folder: str | os.PathLike[s
 
     **Raises:** `ValueError` for an unknown or missing key, and as `load_recording`.
     """
+    (recording,) = recordings_from_mapping(table, folder, several=False)
+    return recording
+
+
+def recordings_from_mapping(
+    table: Mapping[str, Any], folder: str | os.PathLike[str], several: bool = True
+) -> list[Recording]:
+    """As `recording_from_mapping`, of a table whose `file` may be a list: their columns are the same, and `rows` may
+    list a pair for each."""
     check_mapping(table, "[recording]", "file")
     if "file" not in table:
         raise RecordingError("[recording]: 'file' is missing; add it")
-    if not isinstance(table["file"], str):
+    files = table["file"] if isinstance(table["file"], list) and several else [table["file"]]
+    if not files or not all(isinstance(file, str) for file in files):
         raise RecordingError(f"[recording]: 'file' must be a path in quotes, not {table['file']!r}")
-    return load_recording(Path(folder) / table["file"], **{key: table[key] for key in table if key != "file"})
+    rows = table.get("rows")
+    if not (isinstance(rows, list) and rows and isinstance(rows[0], list)):
+        rows = [rows] * len(files)
+    if len(rows) != len(files):
+        raise RecordingError(f"[recording]: rows lists {len(rows)} pairs for {len(files)} files: give one, or one each")
+    mapping = {key: table[key] for key in table if key not in ("file", "rows")}
+    return [load_recording(Path(folder) / file, **mapping, rows=pair) for file, pair in zip(files, rows, strict=True)]
 
 
 def recording_from_arrays(
@@ -138,8 +160,8 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
     check_mapping(mapping, f"the columns of {path}")
     path = _existing(path)
     rate = mapping.get("sample_rate")
-    channels = {key: mapping[key] for key in mapping if key not in ("sample_rate", "joint", "gear_ratio", "name")}
-    options = (rate, mapping.get("joint", "revolute"), mapping.get("gear_ratio", 1.0))
+    channels = {key: mapping[key] for key in mapping if key in ("time", *CHANNELS)}
+    options = (rate, mapping.get("joint", "revolute"), mapping.get("gear_ratio", 1.0), mapping.get("rows"))
     with _named(str(path)):
         signals, joints = _read_signals(path, channels | {"trial": trial}, *options)
         numbers = signals.pop("trial").values[:, 0]
@@ -159,7 +181,12 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
 
 
 def _read_signals(
-    path: Path, entries: Mapping[str, Any], sample_rate: Any, joint: str | Sequence[str], gear_ratio: float
+    path: Path,
+    entries: Mapping[str, Any],
+    sample_rate: Any,
+    joint: str | Sequence[str],
+    gear_ratio: float,
+    rows: Sequence[int] | None = None,
 ) -> tuple[dict[str, Signal], tuple[str, ...]]:
     """All channels of a file in SI units, the clock among them, and the joints; a `trial` column as it is."""
     if (entries.get("time") is None) == (sample_rate is None):
@@ -168,12 +195,27 @@ def _read_signals(
     sources = {channel: source_of(channel, entry) for channel, entry in entries.items() if given(channel, entry)}
     columns = read_columns(path, [column for source in sources.values() for column in source.columns])
     signals = {channel: stack(source.columns, columns) for channel, source in sources.items()}
+    signals = {key: signal if key == "sample_rate" else _cut(signal, rows) for key, signal in signals.items()}
     joints = joint_types(joint, signals["position"].values.shape[1])
     converted = {
         key: signal if key == "trial" else to_si(key, signal, sources[key], joints, gear_ratio)
         for key, signal in signals.items()
     }
     return converted, joints
+
+
+def _cut(signal: Signal, rows: Sequence[int] | None) -> Signal:
+    """The rows from the first to the last one that are wanted, which count from 1."""
+    if rows is None:
+        return signal
+    if not (isinstance(rows, list | tuple) and len(rows) == 2 and all(type(row) is int for row in rows)):
+        raise RecordingError(f"rows must be the first and the last row that count, such as [100, 2500], not {rows!r}")
+    first, last = rows
+    if not 1 <= first < last:
+        raise RecordingError(f"rows = {list(rows)}: the first must be 1 or more, and the last behind it")
+    if last > len(signal.values):
+        raise RecordingError(f"rows = {list(rows)}: the file has {len(signal.values)} rows; lower the last one")
+    return replace(signal, values=signal.values[first - 1 : last])
 
 
 def _existing(path: str | os.PathLike[str]) -> Path:

@@ -8,31 +8,49 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximp.recordings.channels import CHANNELS
 from jaximp.recordings.errors import RecordingError
 from jaximp.types import JOINT_TYPES, nearest
 
-Entry = str | Sequence[str] | Mapping[str, Any]
-"""One channel of the mapping: a column, a list of columns, or `{column, unit, sign, gain, delay}`."""
+Entry = str | int | Sequence[str | int] | Mapping[str, Any]
+"""One channel of the mapping: a column by its name or number, a list of these, or `{columns, unit, sign, gain, delay}`.
+"""
 
-KEYS = ("time", *CHANNELS, "sample_rate", "joint", "gear_ratio", "name")
+KEYS = ("time", *CHANNELS, "sample_rate", "joint", "gear_ratio", "name", "rows")
 """The keys of a mapping, which are the keywords of `load_recording`."""
+
+
+@dataclass(frozen=True)
+class GainError:
+    """Standard deviations of gains, as shares: what all columns have in common, and what each has by itself."""
+
+    common: float
+    each: tuple[float, ...]
+    """One for all columns, or one for each."""
+
+    def covariance(self, n: int) -> NDArray[np.float64]:
+        """(n, n) of the relative errors of n columns."""
+        return self.common**2 + np.diag(np.broadcast_to(self.each, n) ** 2)
 
 
 @dataclass(frozen=True)
 class Source:
     """Where a channel comes from: `values = sign * gain * columns`, in `unit` (times `gain_unit` if it is given)."""
 
-    columns: tuple[str, ...]
+    columns: tuple[str | int, ...]
     unit: str | None = None
     sign: float = 1.0
-    gain: float | None = None
+    gain: tuple[float, ...] | None = None
+    """One for all columns, or one for each."""
     gain_unit: str | None = None
     delay: float | None = 0.0
     """How late it was recorded [s]; None where that is to be estimated."""
     noise: float | None = None
     """Standard deviation of the sensor's error, in `unit`."""
+    gain_error: GainError | None = None
+    """What is not known of the gain."""
 
 
 def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
@@ -51,7 +69,8 @@ def source_of(channel: str, entry: Any) -> Source:
     """Check one entry of the mapping. Time and sample rate are a single column with a unit, and no more."""
     options = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     measured = ["sign", "gain", "delay"] if channel not in ("time", "sample_rate") else []
-    allowed = ["column", "unit", *measured, *(["noise"] if channel == "position" else [])]
+    own = {"position": ["noise"], "torque": ["gain_error"]}.get(channel, [])
+    allowed = ["column", "columns", "unit", *measured, *own]
     for key in options:
         if key == "file":
             raise RecordingError(
@@ -60,19 +79,31 @@ def source_of(channel: str, entry: Any) -> Source:
             )
         if key not in allowed:
             raise RecordingError(f"{channel}: unknown key {key!r}; {nearest(str(key), allowed)}")
-    columns, unit, sign = options.get("column"), options.get("unit"), options.get("sign", 1)
-    columns = [columns] if isinstance(columns, str) else columns
-    if not isinstance(columns, list | tuple) or not columns or not all(isinstance(c, str) and c for c in columns):
-        raise RecordingError(f"{channel}: {entry!r} names no column; give a name, a list of names or {{column = ...}}")
+    columns, unit, sign = columns_of(options), options.get("unit"), options.get("sign", 1)
+    if not columns or ("column" in options) == ("columns" in options):
+        raise RecordingError(
+            f"{channel}: {entry!r} names no column; give a name (or its number, from 1), a list of these, or "
+            "{columns = ...}"
+        )
     if unit is not None and not isinstance(unit, str):
         raise RecordingError(f'{channel}: the unit must be text such as "deg", not {unit!r}')
     if not is_number(sign) or abs(sign) != 1:
         raise RecordingError(f"{channel}: sign must be 1 or -1, not {sign!r}")
-    gain = _gain(channel, options.get("gain"))
+    gain = _gains(channel, options.get("gain"), len(columns))
+    gain_error = _gain_error(channel, options.get("gain_error"), len(columns))
     delay, noise = _delay(channel, options.get("delay", 0.0)), options.get("noise")
     if noise is not None and not (is_number(noise) and 0 < noise < math.inf):
         raise RecordingError(f"{channel}: noise must be the sensor's standard deviation, above 0, not {noise!r}")
-    return Source(tuple(columns), unit, float(sign), *gain, delay, noise)
+    return Source(columns, unit, float(sign), *gain, delay, noise, gain_error)
+
+
+def columns_of(entry: Any) -> tuple[str | int, ...]:
+    """The columns of one entry of a mapping, by name or by number; none where it names none."""
+    columns = entry.get("columns", entry.get("column")) if isinstance(entry, Mapping) else entry
+    several = tuple(columns) if isinstance(columns, list | tuple) else (columns,)
+    numbers = [type(one) is int and one > 0 for one in several]
+    names = [isinstance(one, str) and bool(one) for one in several]
+    return several if all(a or b for a, b in zip(numbers, names, strict=True)) else ()
 
 
 def _delay(channel: str, delay: Any) -> float | None:
@@ -87,10 +118,46 @@ def _delay(channel: str, delay: Any) -> float | None:
     return float(delay)
 
 
-def _gain(channel: str, gain: Any) -> tuple[float | None, str | None]:
-    """The number and the unit of `2.5`, "2.5" or "35.1507 N/V"."""
+def _gains(channel: str, gain: Any, columns: int) -> tuple[tuple[float, ...] | None, str | None]:
+    """Of all columns, or of each of them."""
     if gain is None:
         return None, None
+    several = gain if isinstance(gain, list | tuple) else [gain]
+    _check_count(channel, "gain", len(several), columns)
+    found = [_gain(channel, one) for one in several]
+    units = {unit for _, unit in found}
+    if len(units) != 1:
+        raise RecordingError(f"{channel}: the gains {gain!r} have different units: give all of them in one")
+    return tuple(value for value, _ in found), units.pop()
+
+
+def _check_count(channel: str, key: str, given: int, columns: int) -> None:
+    # A single variable of a file may hold the columns of all joints: how many is seen when it is read.
+    if given != 1 and columns != 1 and given != columns:
+        raise RecordingError(f"{channel}: {key} lists {given} numbers for {columns} columns: give one, or one for each")
+
+
+def _gain_error(channel: str, error: Any, columns: int) -> GainError | None:
+    """From per cent: one number, or `{ common = 10, each = 3 }`, of which each may be a list."""
+    if error is None:
+        return None
+    parts = dict(error) if isinstance(error, Mapping) else {"each": error}
+    for key in parts:
+        if key not in ("common", "each"):
+            hint = nearest(str(key), ["common", "each"])
+            raise RecordingError(f"{channel}: unknown key {key!r} in gain_error; {hint}")
+    common, each = parts.get("common", 0), parts.get("each", 0)
+    several = each if isinstance(each, list | tuple) else [each]
+    _check_count(channel, "gain_error", len(several), columns)
+    if not all(is_number(one) and 0 <= one < math.inf for one in (common, *several)):
+        raise RecordingError(
+            f"{channel}: gain_error is {error!r}: give per cent, zero or more, such as 3 or {{ common = 10, each = 3 }}"
+        )
+    return GainError(common / 100, tuple(one / 100 for one in several))
+
+
+def _gain(channel: str, gain: Any) -> tuple[float, str | None]:
+    """The number and the unit of `2.5`, "2.5" or "35.1507 N/V"."""
     number, _, unit = gain.strip().partition(" ") if isinstance(gain, str) else (gain, "", "")
     try:
         value = math.nan if isinstance(number, bool) else float(number)

@@ -100,7 +100,11 @@ def _judge_samples(label: str, channel: str, x: Numbers, stamps: Numbers) -> _Sa
         spoilt, faults = wrong, [_held(label, updates, len(x))]
     if wrong.any():
         faults.append(_glitches(label, wrong, stamps))
-    return _Samples(x, spoilt, level, faults)
+    # Uneven stamps make leaps of a motion, which no glitch must be told by, and which are no noise.
+    even = (
+        signals.noise_level(known, stamps if updates is None else stamps[updates]) if channel == "position" else level
+    )
+    return _Samples(x, spoilt, even, faults)
 
 
 def _until_next(updates: NDArray[np.int64], wrong: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaximp.recordings.channels import Signal
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.mapping import Source, is_number
+from jaximp.types import Numbers
 
 _SI = {
     "revolute": {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2", "torque": "N m", "command": "N m"},
@@ -40,10 +41,23 @@ def to_si(channel: str, signal: Signal, source: Source, joints: tuple[str, ...],
     units = [si_unit(channel, kind) for kind in kinds]
     factors = [_unit_factor(channel, source, *pair) for pair in zip(signal.labels, units, strict=True)]
     with np.errstate(over="ignore"):
-        factor = np.array(factors) * source.sign * (source.gain or 1.0) * gear
+        factor = np.array(factors) * source.sign * _for_each(channel, "gain", source.gain or (1.0,), signal) * gear
         values = signal.values * factor
+    error = source.gain_error
+    if error is not None:
+        _for_each(channel, "gain_error", error.each, signal)
+    covariance = None if error is None else error.covariance(len(signal.labels))
     noise = None if source.noise is None else float(source.noise * np.abs(factor).max())
-    return Signal(signal.labels, values, source.delay, noise)
+    return Signal(signal.labels, values, source.delay, noise, covariance)
+
+
+def _for_each(channel: str, key: str, given: tuple[float, ...], signal: Signal) -> Numbers:
+    """Of every column, where there is one number for all or one for each."""
+    if len(given) not in (1, len(signal.labels)):
+        raise RecordingError(
+            f"{channel}: {key} lists {len(given)} numbers for {len(signal.labels)} columns: give one, or one for each"
+        )
+    return np.broadcast_to(given, len(signal.labels))
 
 
 def si_unit(channel: str, joint: str) -> str:

@@ -5,6 +5,7 @@ The report gives the answer first and never a number that no trusted window stan
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 from jaximp import plots
 from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filter_settings import design_filters
+from jaximp.identification.residuals import Residuals
 from jaximp.identification.separation import METHODS
 from jaximp.identification.suspects import what
 from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.plots.wording import main_parameter, number, percent, pretty_unit, words
 from jaximp.reports.pages import (
     Alert,
@@ -56,6 +59,8 @@ DERIVATIVES = {
     "wideband": "of the position, right to 0.1 % up to its cut-off",
     "central": "central differences of the position",
 }
+LACKING = "the model lacks"
+"""How a doubt begins that the tests of the model raise."""
 REMEDIES = {
     TRUSTED: "",
     WEAK: "Excite the joint more, with larger and faster motion of several frequencies, or lengthen window.length.",
@@ -74,6 +79,7 @@ CAPTIONS = {
     "nothing changes inside the window. Shaded stretches must not be believed.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
     "each sample (fitted), and with those of a window that had not seen it (held out).",
+    "held_out": "A recording that the parameters have not seen: its torque, and the model's.",
     "condition": "A large condition number or a small singular value means that the motion does not tell the "
     "parameters apart. Where the held-out VAF falls below the other, the parameters change or fit noise.",
     "residual_spectrum": "What the model leaves over, by frequency. A peak that the torque has as well is something "
@@ -95,6 +101,7 @@ CAPTIONS = {
 TITLES = {
     "parameters": "Parameters over time",
     "torque": "Torque",
+    "held_out": "Torque of the recording that was held out",
     "condition": "Condition of the windows",
     "residual_spectrum": "Spectrum of the residual",
     "by_frequency": "Estimates by frequency",
@@ -131,7 +138,13 @@ def live_figures(estimates: Estimates) -> dict[str, Live]:
         "model, held out (window before)": estimates.predicted,
     }
     quality = Quality(condition, np.asarray(fit.sigma_min), vaf, held_out, estimates.threshold)
-    return over_time(windows, Torque(estimates.time, names, estimates.torque, models), quality)
+    live = over_time(windows, Torque(estimates.time, names, estimates.torque, models), quality)
+    return {"torque": live["torque"]} if _is_one_window(estimates) and "torque" in live else live
+
+
+def _is_one_window(estimates: Estimates) -> bool:
+    """Whether a robot's recording is one window, so that nothing is to be shown over windows."""
+    return isinstance(estimates.model, Chain) and len(estimates.end) == 1
 
 
 def write_results(
@@ -160,12 +173,12 @@ def write_results(
 def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) -> dict[str, bytes]:
     """All figures of a report as PNG files."""
     main = estimates_list[0]
-    figures = {
-        "parameters": plots.parameters_over_time(main.summarised()),
-        "torque": plots.torque(main),
-        "condition": plots.condition_over_time(main),
-        "residual_spectrum": plots.residual_spectrum(main),
-    }
+    figures = {"torque": plots.torque(main), "residual_spectrum": plots.residual_spectrum(main)}
+    if not _is_one_window(main):
+        figures["parameters"] = plots.parameters_over_time(main.summarised())
+        figures["condition"] = plots.condition_over_time(main)
+    if main.held_out is not None:
+        figures["held_out"] = plots.torque(main.on_held_out())
     if main.frequencies:
         figures["by_frequency"] = plots.by_frequency(main)
     if main.reflexes:
@@ -192,11 +205,12 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
     return Page(
         title=recording["name"],
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
-        f"{windows['count']} windows of {digits(content['window_s'])} s{method}",
+        f"{windows['count']} window{'s' * (windows['count'] != 1)} of {digits(content['window_s'])} s{method}",
         sections=[
             Section("", [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
             _verdicts(estimates_list[0], content),
             *_tests(content),
+            *_residuals(content),
             *figure_sections(images, TITLES, CAPTIONS, below),
             *_robot_alone(content),
             *closing_sections("Sampling, filters and limits", _settings(content), content["job"]),
@@ -249,6 +263,8 @@ def _answer(content: dict[str, Any]) -> list[Part]:
 
 
 def _parameter_table(found: dict[str, Any]) -> Table:
+    if any("stands_for" in value for value in found["parameters"].values()):
+        return _table_of_sums(found["parameters"])
     rows = []
     for name, value in found["parameters"].items():
         half, mean = value["half_width_95"], value["mean"]
@@ -268,6 +284,59 @@ def _parameter_table(found: dict[str, Any]) -> Table:
         ("Spread (sd)", "number"),
     )
     return Table([Column("Parameter", "text"), *(Column(*head) for head in heads), Column("Unit", "text")], rows)
+
+
+def _table_of_sums(parameters: dict[str, Any]) -> Table:
+    """Of a robot from its URDF, with what each parameter stands for and what the file says it is."""
+    rows = []
+    for name, value in parameters.items():
+        known = value["mean"] is not None
+        interval = f"± {number(value['half_width_95'], 2)}" if known else "–"
+        why = value["doubt"].removeprefix(f"{name}: ")
+        if why.startswith(LACKING):  # what it lacks stands under the tests
+            why = f"what the model lacks: {why.rpartition(': ')[2].removeprefix(name).strip()}"
+        told = why or ("" if value["determined"] else "not determined")
+        numbers = digits(value["mean"]), interval, digits(value["urdf"], 3), pretty_unit(value["unit"])
+        rows.append([name, value["stands_for"], *numbers, told])
+    columns = [
+        Column("Parameter", "text"),
+        Column("Stands for", "text"),
+        Column("Estimate", "answer"),
+        Column("95 % interval"),
+        Column("By the URDF"),
+        Column("Unit", "text"),
+        Column("Why not to be trusted", "text"),
+    ]
+    remark = (
+        "A link's mass, first moments (mc) and inertia move the torque together with those of links further out: each "
+        "row is the sum that the motion shows. The URDF knows no friction and no rotors."
+    )
+    return Table(columns, rows, [k for k, row in enumerate(rows) if row[-1]], remark)
+
+
+def _residuals(content: dict[str, Any]) -> list[Section]:
+    """What is left of the torque of each joint, of a robot or where a recording was held out."""
+    shown = {"in the recording": content["residuals"], "held out": content["held_out"]}
+    several = len(content["recording"]["joints"]) > 1 or content["held_out"] is not None
+    parts = [_residual_table(f"Residual {of}", found) for of, found in shown.items() if found is not None]
+    return [Section("Residuals of each joint", parts)] if several and parts else []
+
+
+def _residual_table(head: str, found: dict[str, Any]) -> Table:
+    names = *(f"joint {k + 1}" for k in range(len(found["moving"]))), "all joints"
+    by_joint = zip(found["moving"], found["still"], strict=True)
+    sizes = [*([digits(moving, 3), digits(still, 3)] for moving, still in by_joint), ["", ""]]
+    shares = zip([*found["relative_moving"], found["total_moving"]], [*found["relative"], found["total"]], strict=True)
+    rows = [
+        [name, *size, *(percent(share) for share in both)]
+        for name, size, both in zip(names, sizes, shares, strict=True)
+    ]
+    heads = "Moving", "Near standstill", "Moving, share of the torque", "Share of all rows"
+    remark = (
+        "Root mean squares, in the unit of the torque. Rows of a joint that is slower than min_velocity do not count "
+        "in the fit, and are near standstill here."
+    )
+    return Table([Column(head, "text"), *map(Column, heads)], rows, remark=remark)
 
 
 def _verdicts(estimates: Estimates, content: dict[str, Any]) -> Section:
@@ -422,7 +491,7 @@ def summary(
         },
         "filters": asdict(job.filter) | {"decimate": design_filters(job.filter, recording.sample_rate).decimate},
         "trust_limits": asdict(job.trust),
-        "min_velocity": job.window.min_velocity,
+        "min_velocity": np.max(job.pipeline_for(recording).min_velocity).item(),
         "versions": versions(),
         "job": job.text,
     }
@@ -431,13 +500,14 @@ def summary(
 
 def estimates_table(estimates: Estimates | Sequence[Estimates], job: WindowJob | None = None) -> pa.Table:
     """One row per window, of one recording or of several. A column's unit is its field's metadata `unit`; the job's
-    text is in the schema's."""
+    text is in the schema's, and what the parameters of a robot from its URDF stand for, as JSON in `sums`."""
     several = [estimates] if isinstance(estimates, Estimates) else estimates
     columns = [
         (same[0].name, same[0].unit, np.concatenate([np.asarray(column.values) for column in same]))
         for same in zip(*(one.columns() for one in several), strict=True)
     ]
-    return table_of(columns, "" if job is None else job.text)
+    sums = {"sums": json.dumps(model.sums)} if isinstance(model := several[0].model, Chain) else {}
+    return table_of(columns, "" if job is None else job.text, **sums)
 
 
 def _result(estimates: Estimates) -> dict[str, Any]:
@@ -479,6 +549,8 @@ def _result(estimates: Estimates) -> dict[str, Any]:
             for one in estimates.misfits
         ],
         "lacking": dict(estimates.lacking),
+        "residuals": _of_residuals(estimates.residuals),
+        "held_out": _of_residuals(estimates.held_out),
         "notes": list(estimates.notes),
     }
 
@@ -512,8 +584,27 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
             "sd": _spread(theta[trusted, k]),
             "median_stderr": _median(stderr[trusted, k]),
             "half_width_95": _median((high - low)[trusted, k] / 2),
-        }
+        } | _of_chain(estimates, k)
     return found
+
+
+def _of_chain(estimates: Estimates, k: int) -> dict[str, Any]:
+    """Of a robot from its URDF: what a parameter stands for, what the file says it is, and why it cannot be trusted."""
+    if not isinstance(estimates.model, Chain):
+        return {}
+    name = estimates.names[k]
+    reasons = [reason for reason in estimates.doubted.get(name, ()) if reason]
+    doubt = reasons[len(reasons) // 2] if 2 * len(reasons) > len(estimates.end) else ""
+    own = float(estimates.model.parameters[k])
+    return {"stands_for": estimates.model.sums[name], "urdf": own, "doubt": doubt}
+
+
+def _of_residuals(found: Residuals | None) -> dict[str, Any] | None:
+    """Without the torques over time."""
+    if found is None:
+        return None
+    joints = {name: getattr(found, name).tolist() for name in ("moving", "still", "relative", "relative_moving")}
+    return joints | {"total": found.total, "total_moving": found.total_moving}
 
 
 def _reflex(reflex: Reflex, estimates: Estimates, factor: NDArray[np.float64] | None = None) -> dict[str, Any]:

@@ -243,8 +243,9 @@ def _version(name: str) -> str:
     return metadata.version(name)
 
 
-def table_of(columns: Sequence[tuple[str, str, Any]], job: str) -> pa.Table:
-    """A table of (name, unit, values): the unit is its field's metadata `unit`, the job's text is in the schema's."""
+def table_of(columns: Sequence[tuple[str, str, Any]], job: str, **more: str) -> pa.Table:
+    """A table of (name, unit, values): the unit is its field's metadata `unit`, the job's text (and `more`) is in the
+    schema's."""
     import pyarrow as pa
 
     arrays = [values if isinstance(values, pa.Array) else pa.array(np.asarray(values)) for _, _, values in columns]
@@ -252,7 +253,7 @@ def table_of(columns: Sequence[tuple[str, str, Any]], job: str) -> pa.Table:
         pa.field(name, array.type, metadata={"unit": unit})
         for (name, unit, _), array in zip(columns, arrays, strict=True)
     ]
-    about = {"jaximp_version": _version("jaximp"), "job": job}
+    about = {"jaximp_version": _version("jaximp"), "job": job, **more}
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import comb
 
 import numpy as np
@@ -12,6 +12,8 @@ DIFFERENCES, FEWEST_DIFFERENCES = (4, 6, 8, 12), 20
 """Orders of differences in which noise is looked for, and how many times as many samples there must be."""
 
 
+EVEN = 0.01
+"""Share of a step by which stamps may differ from even ones for differences to be those of even ones."""
 SHORT = 3
 """Missing samples across which a leap is told from motion."""
 
@@ -88,14 +90,17 @@ def _held_over_gaps(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(missing & (at - last <= SHORT), x[last], x)
 
 
-def noise_level(x: NDArray[np.float64]) -> float:
+def noise_level(x: NDArray[np.float64], stamps: NDArray[np.float64] | None = None) -> float:
     """Standard deviation of the white noise in a smooth signal (N,), from its fourth to twelfth differences.
 
     A motion vanishes in them, a fast one in the higher ones alone: the smallest estimate counts. The median keeps
     jumps from counting. A coarse encoder leaves at least the noise of its rounding, step/sqrt(12).
+
+    **Arguments:** `stamps` (N,) of samples that are not evenly spaced: motion vanishes in their divided differences.
     """
-    levels = [_level_of_differences(x, order) for order in DIFFERENCES if len(x) > FEWEST_DIFFERENCES * order]
-    known = [level for level in levels or [_level_of_differences(x, 4)] if np.isfinite(level)]
+    level = _level_of_differences if stamps is None or _even(stamps) else partial(_level_of_divided, stamps)
+    levels = [level(x, order) for order in DIFFERENCES if len(x) > FEWEST_DIFFERENCES * order]
+    known = [one for one in levels or [level(x, 4)] if np.isfinite(one)]
     if not known:
         return 0.0
     return float(max(min(known), quantisation_step(x) / np.sqrt(12.0)))
@@ -106,6 +111,24 @@ def _level_of_differences(x: NDArray[np.float64], order: int) -> float:
     found = np.diff(x, order)
     found = found[np.isfinite(found)]
     return 1.4826 * float(np.median(np.abs(found))) / np.sqrt(comb(2 * order, order)) if len(found) else np.nan
+
+
+def _even(stamps: NDArray[np.float64]) -> bool:
+    steps = np.diff(stamps)
+    return bool(np.abs(steps - np.median(steps)).max(initial=0.0) <= EVEN * np.median(steps))
+
+
+def _level_of_divided(stamps: NDArray[np.float64], x: NDArray[np.float64], order: int) -> float:
+    """As `_level_of_differences`, of divided differences, each times what makes its weights those of unit variance."""
+    if len(x) <= order:
+        return np.nan
+    t, values = (np.lib.stride_tricks.sliding_window_view(z, order + 1) for z in (stamps, x))
+    t = t / np.median(np.diff(stamps))
+    apart = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
+    weights = 1 / apart.prod(axis=2)
+    found = np.abs((weights * values).sum(axis=1)) / np.sqrt((weights**2).sum(axis=1))
+    found = found[np.isfinite(found)]
+    return 1.4826 * float(np.median(found)) if len(found) else np.nan
 
 
 def quantisation_step(x: NDArray[np.float64]) -> float:

@@ -30,6 +30,7 @@ TOGETHER = 3.0
 """Standard errors by which all windows together may find a negative inertia."""
 FEWEST_TOGETHER = 3
 """Windows that are judged together."""
+OF_LINKS = ("link_mass", "first_moment", "link_inertia")
 MASSES = (Role("inertia"), Role("base_inertia", (1,)), Role("base_inertia", (3,)))
 """What cannot be below zero."""
 
@@ -222,13 +223,23 @@ def judged_names(model: Model, limits: TrustLimits = USUAL) -> list[str]:
 
 
 def _judged(names: Sequence[str], roles: Sequence[Role], chosen: Sequence[str]) -> NDArray[np.bool_]:
-    """Which parameters the verdict looks at: the chosen, or all but a constant torque, which slow noise hides first."""
+    """Which parameters the verdict looks at: the chosen, or all but a constant torque, which slow noise hides first.
+
+    Of a robot from a URDF none, unless some are chosen: hardly any motion determines all of its parameters, and each
+    has a verdict of its own.
+    """
     for name in chosen:
         if name not in names:
             raise ValueError(f"trust.parameters has an unknown parameter '{name}': {nearest(name, list(names))}")
+    all_but = {role.kind for role in roles} if is_chain(roles) else {"offset"}
     return np.array(
-        [name in chosen if chosen else role.kind != "offset" for name, role in zip(names, roles, strict=True)]
+        [name in chosen if chosen else role.kind not in all_but for name, role in zip(names, roles, strict=True)]
     )
+
+
+def is_chain(roles: Sequence[Role]) -> bool:
+    """Whether parameters are those of the links of a robot from a URDF."""
+    return any(role.kind in OF_LINKS for role in roles)
 
 
 def _element(role: Role) -> str:

@@ -7,7 +7,7 @@ imported in the function that needs them. Nothing is ever unpickled.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,18 @@ from jaximp.recordings.readers import hdf5, mat, npz, parquet, text
 class Format:
     """A kind of file, and how it is read."""
 
-    read: Callable[[Path, list[str]], dict[str, Any]]
+    read: Callable[[Path, list[Any]], Mapping[Any, Any]]
     """The named columns of a file. What its library raises, `read_columns` puts into words."""
-    count: Callable[[Path, list[str]], int]
+    count: Callable[[Path, list[Any]], int]
     """How many samples a file says that it holds of some columns, without reading them; zero where it does not say."""
     matrices: bool = False
     """Whether one variable may hold several columns, one per joint."""
+    numbered: bool = False
+    """Whether columns can be asked for by number, from 1."""
 
 
 FORMATS = {
-    **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count)),
+    **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count, numbered=True)),
     ".parquet": Format(parquet.read, parquet.count),
     ".mat": Format(mat.read, mat.count, matrices=True),
     **dict.fromkeys((".h5", ".hdf5"), Format(hdf5.read, hdf5.count, matrices=True)),
@@ -40,11 +42,14 @@ MATRICES = tuple(extension for extension, kind in FORMATS.items() if kind.matric
 """Extensions of files in which one variable may hold several columns."""
 
 
-def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
+def read_columns(path: Path, names: Sequence[str | int]) -> Mapping[str | int, Any]:
     """The named columns of a file; whatever a reader's library raises becomes one line."""
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise RecordingError(f"cannot read '{path.suffix}' files; use one of: {', '.join(FORMATS)}")
+    numbers = [name for name in names if isinstance(name, int)]
+    if numbers and not kind.numbered:
+        raise RecordingError(f"column {numbers[0]}: numbers are for text files, give its name")
     try:
         return kind.read(path, list(dict.fromkeys(names)))
     except (RecordingError, MemoryError):
@@ -59,14 +64,14 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Any]:
         raise RecordingError(f"cannot be read as {path.suffix} ({cause}): {remedy}") from None
 
 
-def count_samples(path: Path, names: list[str]) -> int:
+def count_samples(path: Path, names: Sequence[str | int]) -> int:
     """How many samples a file says that it holds of some columns, without reading them: zero where it does not say.
 
     **Raises:** `RecordingError` for a variable that must not be read. What else is wrong, `read_columns` says.
     """
     kind = FORMATS.get(path.suffix.lower())
     try:
-        return 0 if kind is None else kind.count(path, names)
+        return 0 if kind is None else kind.count(path, list(names))
     except (RecordingError, MemoryError):
         raise
     except Exception:

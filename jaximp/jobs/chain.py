@@ -1,0 +1,101 @@
+"""A robot from its URDF in a job: the table `[model.robot]` with a `urdf`.
+
+```toml
+[model.robot]
+urdf = "ur10e.urdf"        # beside the job file
+tip = "tool0"
+friction = ["viscous", "coulomb"]
+rotor = true
+offset = true
+min_velocity = 0.02        # rad/s: slower rows of a joint do not count
+```
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from jaximp.models.chain import Chain
+from jaximp.types import listed
+
+PerJoint = float | list[float] | dict[str, float]
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """Keywords of `models.Chain`."""
+
+    urdf: str
+    """The robot's URDF, a path that begins at the job's folder."""
+    tip: str | None = None
+    """Link whose pose is meant; by default the one that the last joint moves."""
+    base: str | None = None
+    """Link from which the chain starts and that does not move; by default the root."""
+    gravity: list[float] | None = None
+    """In the base's frame [m/s^2]; by default `[0, 0, -9.81]`."""
+    locked: list[str] | dict[str, float] | None = None
+    """Joints that stay: their names, or a table with their positions [rad or m]."""
+    friction: bool | str | list[str] = False
+    """`viscous`, `coulomb`, `asymmetric_coulomb`, `stribeck`, or several of them; `true` for the first two."""
+    rotor: bool = False
+    """A column for the inertia of each motor's rotor."""
+    offset: bool = False
+    """A column of a constant torque for each joint."""
+    gear: PerJoint = 1.0
+    """Turns of the motor for one of the joint: a number, one for each joint, or a table with those of some."""
+    coupling: list[list[float]] | None = None
+    """Where motors share joints: joints = coupling @ (motors / gear)."""
+    side: str = "motor"
+    """Whether positions and torques are those of the `motor` or of the `joint`, where there is a gear or coupling."""
+    zero: PerJoint = 0.0
+    """The URDF's position of each joint where the recorded one is zero [rad or m]."""
+    sign: PerJoint = 1.0
+    """-1 where the controller counts the other way than the URDF."""
+    stribeck_velocity: PerJoint = 0.1
+    """Velocity at which Stribeck's friction has fallen [rad/s or m/s]."""
+    stribeck_exponent: PerJoint = 2.0
+    """Exponent of Stribeck's curve."""
+    sign_width: PerJoint = 0.0
+    """Velocity around which the sign of dry friction turns gradually [rad/s or m/s]; at zero it jumps, and near
+    standstill it then follows the noise of the velocity."""
+    min_velocity: PerJoint = 0.0
+    """Slower rows of a joint do not count [rad/s or m/s]: below its breakaway friction is not what the model says."""
+    strict: bool = True
+    """`false` takes links without inertia for massless, and limits of zero for none."""
+
+    def make(self, folder: Path) -> Chain:
+        """The model, read once from each state of the file.
+
+        **Raises:** `ValueError` with one line for what is wrong with the file or does not fit it.
+        """
+        path = folder / self.urdf
+        changed = path.stat().st_mtime_ns if path.is_file() else 0
+        return _read(path, changed, json.dumps({key: value for key, value in vars(self).items() if key != "urdf"}))
+
+    def check(self, chain: Chain, joints: Sequence[str]) -> None:
+        """Refuse a recording of other joints than the URDF's."""
+        if len(joints) != chain.n_joints:
+            raise ValueError(
+                f"{self.urdf} has {chain.n_joints} joints that move ({listed(chain.joint_names)}), but the recording "
+                f"{len(joints)}: map a column of position and torque for each, in this order, or name others in locked"
+            )
+        for name, kind, recorded in zip(chain.joint_names, chain.joint_kinds, joints, strict=True):
+            if kind != recorded:
+                kinds = ", ".join(f'"{one}"' for one in chain.joint_kinds)
+                raise ValueError(f"joint '{name}' of {self.urdf} is {kind}: write joint = [{kinds}] in [recording]")
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, changed: int, settings: str) -> Chain:
+    given: dict[str, Any] = json.loads(settings)
+    if given["gravity"] is None:
+        del given["gravity"]
+    given["stribeck"] = given.pop("stribeck_velocity"), given.pop("stribeck_exponent")
+    width = given.pop("sign_width")
+    chain = Chain.from_urdf(path, **given)
+    return chain.with_sign_width(width) if width != 0 else chain
