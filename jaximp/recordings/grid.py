@@ -13,8 +13,9 @@ from jaximp.recordings.errors import RecordingError
 
 JITTER = 0.01
 """Stamps that differ from a uniform grid by less than this share of an interval are taken as even."""
-PACKET, OFTEN = 5.0, 0.02
-"""Stamps come in packets if so large a share of the intervals is so many times the usual one, and most of the time."""
+PACKET, OFTEN, FEWEST_PACKETS = 5.0, 0.02, 10
+"""Stamps come in packets if so large a share of the intervals, and so many, are so many times the usual one, and most
+of the time."""
 GAP = 1.5
 """An interval longer than this many median intervals is a gap."""
 LARGEST_GROWTH = 50
@@ -86,7 +87,7 @@ def on_uniform_grid(stamps: NDArray[np.float64], samples: NDArray[np.float64], v
 def _refuse_packets(intervals: NDArray[np.float64], median: float) -> None:
     """Refuse stamps of when samples arrived, and not of when they were measured."""
     waits = intervals > PACKET * median
-    if waits.mean() > OFTEN and intervals[waits].sum() > 0.5 * intervals.sum():
+    if waits.sum() >= FEWEST_PACKETS and waits.mean() > OFTEN and intervals[waits].sum() > 0.5 * intervals.sum():
         wait, rate = float(np.median(intervals[waits])), len(intervals) / intervals.sum()
         raise RecordingError(
             f"the time stamps come in packets ({1 / waits.mean():.2g} samples at once, then nothing for "

@@ -202,7 +202,7 @@ def _crowd(x: Numbers, level: float, step: float) -> NDArray[np.bool_] | None:
         return exact
     width = max(1.01 * step, 1e-3 * span)
     surest, best, widest = 0.0, 0.0, min(max(8 * level, width), 0.2 * span) if np.isfinite(level) else width
-    widths = width * 1.3 ** np.arange(max(0, int(np.log(widest / width) / np.log(1.3)) + 1))
+    widths = width * 1.3 ** np.arange(max(0, int(np.log(widest / width) / np.log(1.3))) + 1)
     near = np.sort(below[below < 2 * widths[-1]])
     for width, first, both in zip(widths, *np.searchsorted(near, [widths, 2 * widths]).tolist(), strict=True):
         second = both - first
@@ -281,9 +281,12 @@ def bridged(x: Numbers) -> NDArray[np.bool_]:
     """Samples of a noisy signal (N,) that lie on straight lines to the last digit: a recorder lost them and drew a line
     to the next one that it had."""
     out, rounded = np.zeros(len(x), bool), _rounded_by(x)
-    for first, last in [] if rounded is None else _on_lines(x, rounded):
-        if last - first >= LINE:
-            out[first + 1 : last] = True
+    lines = [] if rounded is None else _on_lines(x, rounded)
+    long = [(first, last) for first, last in lines if last - first >= LINE]
+    if len(long) < 0.5 * len(lines):  # a controller that counts an encoder's steps makes short ones, and few long ones
+        return out
+    for first, last in long:
+        out[first + 1 : last] = True
     return out
 
 

@@ -124,3 +124,11 @@ def test_real_recordings_have_few_glitches_and_no_limit(data_folder: object) -> 
     for column in (1, 2):
         assert glitches(table[:, column]).mean() < 1e-3
     assert torque_limits(table[:, 2], table[:, 1], 1000.0) == ()
+
+
+@pytest.mark.parametrize("levels", [3, 4, 5, 6])
+def test_converters_of_few_levels_are_judged(levels: int) -> None:
+    position, torque = joint(6)
+    step = np.ptp(torque) / (levels - 1)
+    for limit in torque_limits(step * np.round(torque / step), position, RATE):
+        assert limit.at.any()
