@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,6 +16,7 @@ class What(StrEnum):
 
     rig = "rig"
     arm = "arm"
+    robot = "robot"
 
 
 class Holding(StrEnum):
@@ -39,15 +41,20 @@ def simulate(
     holding: Annotated[Holding, typer.Option("--holding", help="rig: what holds the handle.")] = Holding.spring,
     perturbed: Annotated[int, typer.Option("--perturbed", help="arm: how many movements are perturbed.")] = 20,
     unperturbed: Annotated[int, typer.Option("--unperturbed", help="arm: how many are not.")] = 40,
-    duration: Annotated[float, typer.Option("--duration", help="arm: of a movement, in s.")] = 2.0,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="arm, robot: of a movement, in s; by default 2 and 30.")
+    ] = None,
     position_step: Annotated[float, typer.Option("--position-step", help="arm: step of the encoders, in um.")] = 1.0,
     force_noise: Annotated[float, typer.Option("--force-noise", help="arm: white noise of the force, in N.")] = 0.0,
     format: Annotated[Format, typer.Option("--format", help="arm: of the recordings.")] = Format.parquet,
+    urdf: Annotated[
+        Path | None, typer.Option("--urdf", help="robot: its URDF; by default an arm of six joints.")
+    ] = None,
 ) -> None:
     """Write simulated recordings, with a job file that `identify` reads.
 
     `rig`: a rig of one joint, alone and held. `arm`: reaching movements of an arm whose hand is perturbed at times, and
-    postures that it keeps; truth.json holds what is to be found.
+    postures that it keeps; truth.json holds what is to be found. `robot`: an arm that is like its URDF, but not quite.
     """
     from jaximp.recordings.outputs import new_folder
 
@@ -56,11 +63,16 @@ def simulate(
             from jaximp.simulation.rig_recordings import write_rig_recordings
 
             write_rig_recordings(folder, holding.value, seed)
+        elif what is What.robot:
+            from jaximp.simulation.robot_recordings import write_robot_recordings
+
+            write_robot_recordings(folder, urdf, 30.0 if duration is None else duration, seed, progress)
         else:
             from jaximp.simulation.arm_recordings import Sensors, write_arm_recordings
 
             write_arm_recordings(
-                folder, perturbed=perturbed, unperturbed=unperturbed, duration=duration, seed=seed,
+                folder, perturbed=perturbed, unperturbed=unperturbed, seed=seed,
+                duration=2.0 if duration is None else duration,
                 sensors=Sensors(1e-6 * position_step, force_noise), format=format.value, progress=progress,
             )  # fmt: skip
         progress(1.0)

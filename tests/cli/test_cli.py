@@ -110,6 +110,19 @@ def test_demo_finds_the_step(run, tmp_path: Path) -> None:  # type: ignore[no-un
         np.testing.assert_allclose(stiffness[when].mean(), value, rtol=0.03)
 
 
+@pytest.mark.slow
+def test_a_simulated_robot_is_identified(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    assert run("simulate", "robot", "--out", tmp_path / "robot", "--duration", 12)[0] == 0
+    assert run("identify", tmp_path / "robot" / "job.toml", "--out", tmp_path / "out")[0] == 0
+    truth = json.loads((tmp_path / "robot" / "truth.json").read_text())
+    table = pq.read_table(tmp_path / "out" / "estimates.parquet").to_pydict()
+    found, stderr = (np.array([table[f"{name}{end}"][0] for name in truth]) for end in ("", "_stderr"))
+    z = (found - [one["value"] for one in truth.values()]) / stderr
+    assert np.sqrt(np.mean(z**2)) < 2
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["held_out"]["total_moving"] < 0.03
+
+
 def test_usage_errors_have_status_2(run) -> None:  # type: ignore[no-untyped-def]
     assert run("identify")[0] == 2
     assert run("reproduce", "nobody1900", "--out", "x")[0] == 2
