@@ -16,8 +16,8 @@ from jaximp.types import Fault, Numbers, listed
 
 MEASURED = ("position", "torque", "velocity", "acceleration", "force")
 """Channels that a sensor measured; a reference and a command may leap."""
-ROUGH = ("torque", "force")
-"""Channels with noise, which neither lies on lines nor repeats itself; a position is smooth, and does."""
+ROUGH = "torque"
+"""The channel with noise, which neither lies on lines nor repeats itself; a position is smooth, and does."""
 SPLINE = 5
 """Degree of what is laid through the measured samples of a signal that was held between them."""
 
@@ -82,7 +82,7 @@ class _Samples(NamedTuple):
 
 def _judge_samples(label: str, channel: str, x: Numbers, stamps: Numbers) -> _Samples:
     updates = signals.held_updates(x)
-    slower = signals.corners(x) if updates is None and channel in ROUGH else None
+    slower = signals.corners(x) if updates is None and channel == ROUGH else None
     if slower is not None:
         places, values = slower
         at = np.interp(places, np.arange(len(stamps)), stamps)
@@ -118,7 +118,7 @@ def _until_next(updates: NDArray[np.int64], wrong: NDArray[np.bool_], count: int
 
 def _traces(label: str, channel: str, x: Numbers) -> list[tuple[Fault, NDArray[np.bool_]]]:
     """What a recorder did to samples that no noise does, and (N,) where."""
-    if channel not in ROUGH:
+    if channel != ROUGH:
         return []
     kinds = [
         ("lines", signals.bridged(x), "lie on straight lines to the last digit, as if drawn over lost samples"),

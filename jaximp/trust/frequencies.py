@@ -122,6 +122,7 @@ def estimate_by_frequency(
     apart, influence, promised = (np.stack(x) for x in zip(*found, strict=True))
     # Not by the scatter, which is small by luck where few windows are: what is chosen for that would be too sure.
     known = every * promised <= (largest_error * whole) ** 2
+    known &= np.isfinite(influence).all(axis=1)  # nor what a single window tells
     scatter = (1 - 1 / count) * (influence**2).sum(axis=1)
     # What is left of the windows says nothing of their own parameters: the errors of both add up (Hausman 1978).
     stderr = np.sqrt(scatter + errors.sum(axis=0) / count**2)
