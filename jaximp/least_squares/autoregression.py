@@ -194,11 +194,9 @@ def _joined(W: Numbers, window: int, every: int) -> tuple[Numbers, int]:
     told = window / every - p
     if not p or not 0 < told < ROWS_PER_TERM * ENOUGH:
         return W, window
-    windows = n // window
-    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, windows)
+    count = min(-int(-ROWS_PER_TERM * JOINED // told), MOST_COLUMNS // p, n // window)
     if count < 2:
         return W, window
-    count = windows // -(-windows // count)  # as many, so that hardly any window is left over
     apart = np.zeros((n, count, p))
     apart[np.arange(n), np.arange(n) // window % count] = W
     return apart.reshape(n, -1), count * window

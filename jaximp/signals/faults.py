@@ -30,8 +30,8 @@ EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
 FEWEST_UPDATES, LONGEST_HELD = 20, 64
 """Of a signal that is held between its samples, and for how many samples."""
-ROUNDED = 1e-9
-"""Share of a signal's range that a number in a file is rounded by, if nothing coarser is seen."""
+ROUNDED = 1e-12
+"""Share of a signal's range by which all digits of a number are rounded, if nothing coarser is seen."""
 NOISY = 100.0
 """Fourth differences of a signal are so many of its steps, or an exact line or a repeated block may be there by
 chance."""
