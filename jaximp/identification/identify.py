@@ -209,7 +209,8 @@ def robot_sameness(prepared: Prepared, pair: Pair) -> Sameness | None:
     whiten, loaded = whitener(prepared.pipeline), pair.loaded
     if whiten is None:
         return None
-    white = whiten(loaded.human, loaded.torque - loaded.robot @ pair.robot_fit.theta, loaded.valid)
+    torque = loaded.torque - loaded.robot @ pair.robot_fit.theta
+    white = whiten(loaded.human, torque, loaded.valid, loaded.robot)
     return Sameness.of(pair.robot, prepared.model, pair.robot_fit, pair.change, loaded, white)
 
 

@@ -36,6 +36,9 @@ FEWEST_ROWS = 200
 """Independent rows of all windows from which a scatter of their scores is judged."""
 AT_ONCE = 1 << 20
 """Numbers of windows' columns that are worked on at once."""
+UNUSUAL = 4.0
+"""A window whose scores scatter so many times as much as is usual, such as one in which the joint changes, says nothing
+of the others."""
 LEAST_LEFT = 1e-3
 """A row's residual is taken for such a share of its error at least, however much of it the parameters took."""
 
@@ -192,7 +195,9 @@ def _inflation(W: Numbers, windows: DisjointFit, every: int, shares: Callable[[i
         error = residual / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT))
         plain = (share**2).sum(axis=0) * (residual @ residual) / freedom[k]
         ratios.append(((share * error[:, None]) ** 2).sum(axis=0) / plain)
-    return np.sqrt(np.average(ratios, axis=0, weights=freedom[chosen]))
+    usual = np.array(ratios)
+    weights = np.where(usual <= UNUSUAL * np.median(usual, axis=0), freedom[chosen, None], 0)
+    return np.asarray(np.sqrt((weights * usual).sum(axis=0) / weights.sum(axis=0)))
 
 
 def from_white(fit: SlidingFit, ordinary: SlidingFit, white: White, seen: Score | None = None) -> SlidingFit:

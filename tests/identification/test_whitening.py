@@ -78,6 +78,16 @@ def test_without_enough_rows_the_textbook_stands() -> None:
     assert (made(W, random.normal(size=N) * W[:, 0], valid).inflation == 1).all()
 
 
+def test_a_joint_that_changes_in_one_window_makes_no_other_unsure() -> None:
+    """It changes while it moves most, so that what is left stands where it counts most."""
+    random = np.random.default_rng(4)
+    W, noise, within = columns(random), random.normal(size=N), np.arange(N) % 200
+    W[:, 0] *= np.where((within >= 80) & (within < 120), 1.0, 0.05)
+    changed = (np.arange(N) // 200 == 7) * np.where(within < 100, -30, 30) * W[:, 0]
+    np.testing.assert_allclose(made(W, noise).inflation, 1.0, atol=0.05)
+    np.testing.assert_allclose(made(W, noise + changed).inflation, 1.0, atol=0.05)
+
+
 def test_further_columns_pass_the_filter_of_the_last_output() -> None:
     random = np.random.default_rng(5)
     filtered = Pipeline(RATE, HumanJoint(), WindowSettings(2.0), FilterSettings(decimation_cutoff=20.0, decimate=1))
