@@ -103,8 +103,11 @@ def condition_over_time(estimates: Estimates) -> Figure:
 
 
 @styled
-def torque(estimates: Estimates) -> Figure:
-    """Measured torque against the model's, and what is left: one row per joint, an excerpt beside long recordings."""
+def torque(estimates: Estimates, model: str = "model, fitted") -> Figure:
+    """Measured torque against the model's, and what is left: one row per joint, an excerpt beside long recordings.
+
+    **Arguments:** `model`, what the legend calls the torque with the parameters that belong to each sample.
+    """
     time, n_joints = estimates.time, estimates.torque.shape[1]
     long = time[-1] - time[0] > LONG
     figure = Figure(figsize=(WIDTH, 2.9 * n_joints + 0.5))
@@ -114,7 +117,8 @@ def torque(estimates: Estimates) -> Figure:
         upper, lower = panels[2 * joint : 2 * joint + 2]
         if long:
             _torque_envelopes(upper[0], lower[0], estimates, joint)
-        _torque_lines(upper[-1], lower[-1], estimates, joint, _excerpt(estimates, joint) if long else slice(None))
+        part = _excerpt(estimates, joint) if long else slice(None)
+        _torque_lines(upper[-1], lower[-1], estimates, joint, part, model)
         what, unit = effort(estimates, joint)
         whose = f"joint {joint + 1}: " if n_joints > 1 else ""
         upper[0].set_ylabel(f"{whose}{what} ({unit})")
@@ -370,23 +374,17 @@ def _legend(figure: Figure, panel: Axes, several: Sequence[Estimates], *others: 
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.5)
 
 
-def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, part: slice) -> None:
+def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, part: slice, model: str) -> None:
     time, measured = estimates.time[part], estimates.torque[part, joint]
     seen, unseen = estimates.reconstructed[part, joint], estimates.predicted[part, joint]
     far = beyond(torque_limits(estimates.torque[:, joint]))
     draw_line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
-    draw_line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label="model, fitted")
-    draw_line(
-        upper,
-        time,
-        np.clip(unseen, *far),
-        color=VERMILLION,
-        linestyle="--",
-        linewidth=0.9,
-        label="model, held out (window before)",
-    )
+    draw_line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label=model)
     draw_line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
-    draw_line(lower, time, np.clip(measured - unseen, *far), color=VERMILLION, linestyle="--", linewidth=0.9)
+    if np.isfinite(unseen).any():
+        dashed = {"color": VERMILLION, "linestyle": "--", "linewidth": 0.9}
+        draw_line(upper, time, np.clip(unseen, *far), label="model, held out (window before)", **dashed)
+        draw_line(lower, time, np.clip(measured - unseen, *far), **dashed)
 
 
 def _torque_envelopes(upper: Axes, lower: Axes, estimates: Estimates, joint: int) -> None:

@@ -77,6 +77,8 @@ CAPTIONS = {
     "parameters": "Each estimate is an average over its window and stands at the window's middle; what changes faster "
     "is blurred. The interval holds the truth with probability 95 % if model and noise are as assumed and "
     "nothing changes inside the window. Shaded stretches must not be believed.",
+    "against_urdf": "Each parameter with its interval of 95 %, beside the value of the URDF, which knows no friction "
+    "and no rotors. Of several windows their mean.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
     "each sample (fitted), and with those of a window that had not seen it (held out).",
     "held_out": "A recording that the parameters have not seen: its torque, and the model's.",
@@ -100,6 +102,7 @@ CAPTIONS = {
 
 TITLES = {
     "parameters": "Parameters over time",
+    "against_urdf": "Parameters against the URDF",
     "torque": "Torque",
     "held_out": "Torque of the recording that was held out",
     "condition": "Condition of the windows",
@@ -174,11 +177,13 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
     """All figures of a report as PNG files."""
     main = estimates_list[0]
     figures = {"torque": plots.torque(main), "residual_spectrum": plots.residual_spectrum(main)}
+    if isinstance(main.model, Chain):
+        figures["against_urdf"] = plots.parameters_against_urdf(main)
     if not _is_one_window(main):
         figures["parameters"] = plots.parameters_over_time(main.summarised())
         figures["condition"] = plots.condition_over_time(main)
     if main.held_out is not None:
-        figures["held_out"] = plots.torque(main.on_held_out())
+        figures["held_out"] = plots.torque(main.on_held_out(), "model, from the other recordings")
     if main.frequencies:
         figures["by_frequency"] = plots.by_frequency(main)
     if main.reflexes:
