@@ -1,4 +1,4 @@
-"""The command line: `jaximp demo | check | identify | batch | posterior | design | simulate | reproduce`.
+"""The command line: `jaximp demo | check | identify | batch | posterior | design | export | simulate | reproduce`.
 
 One command a file. A file imports what its command needs when that runs: help must not wait for it.
 """
@@ -20,6 +20,7 @@ from jaximp.cli.batch import batch
 from jaximp.cli.check import check
 from jaximp.cli.demo import demo
 from jaximp.cli.design import design
+from jaximp.cli.export import export
 from jaximp.cli.identify import identify
 from jaximp.cli.posterior import posterior
 from jaximp.cli.reproduce import reproduce
@@ -89,5 +90,5 @@ def options(
     """What can be asked of jaximp itself."""
 
 
-for each in (demo, check, identify, posterior, design, simulate, batch, reproduce):
+for each in (demo, check, identify, posterior, design, export, simulate, batch, reproduce):
     app.command()(prepared(each))

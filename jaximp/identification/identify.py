@@ -20,13 +20,14 @@ from jaximp.identification.judging import judge
 from jaximp.identification.misfit import find_human_misfits, find_misfits
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, prepare, whitener, with_windows
-from jaximp.identification.residuals import Residuals, of_whole_recording
+from jaximp.identification.residuals import Residuals
 from jaximp.identification.robot_changes import Doubts, Sameness
 from jaximp.identification.rows import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
 from jaximp.identification.weighted import weighted_fit
 from jaximp.identification.whitening import from_filtered, from_white
+from jaximp.identification.whole import of_whole_recording
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Joints, combine

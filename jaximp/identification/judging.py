@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp.identification.common_errors import with_common_errors
 from jaximp.identification.comparisons import by_frequency, changes, gain_in_words
 from jaximp.identification.corrections import corrected
 from jaximp.identification.delays import find_delay
 from jaximp.identification.estimates import Estimates, Reflex
-from jaximp.identification.gains import with_gain_errors
 from jaximp.identification.instruments import MOVED, REMEDY, Drive, belongs_with_later_motion, in_windows_of
 from jaximp.identification.misfit import (
     Known,
@@ -88,7 +88,7 @@ def judge(
     of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
     of_model = of_model.with_gain(gain_in_words(model, fit, _apart(place)), judged)
     of_model = of_model.with_doubts(doubts, judged)
-    sure, fit = fit, with_gain_errors(prepared, rows, _with_open_moves(fit, of_model.moves), place)
+    sure, fit = fit, with_common_errors(prepared, rows, _with_open_moves(fit, of_model.moves), place)
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measure = partial(measure_windows, fit, model.names, model.roles, full, scale, prepared.column_noise, threshold)
     measured, doubted = measure(limits), {}

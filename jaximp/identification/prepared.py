@@ -27,10 +27,12 @@ from jaximp.identification.robot_changes import (
 from jaximp.identification.rows import Filtered, Measured, Rows, column_noise, measure, once, regress, rows_of
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
+from jaximp.identification.stribeck import Curves, find_curves
 from jaximp.identification.weighted import by_size, sizes_of_joints
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
 from jaximp.models.base import Joints, Model, combine
+from jaximp.models.chain import Chain
 from jaximp.recordings.delays import moved_forward
 from jaximp.recordings.join import join_recordings
 from jaximp.types import Recording, RobotAlone
@@ -81,6 +83,8 @@ class Prepared:
     """What is known of what moves each joint (of joints side by side), where something is."""
     explained: Recording | None = None
     """With the part of the motion that a reference explains, where the rows are those of this part."""
+    curves: Curves | None = None
+    """Stribeck's curves, where they were to be found."""
     weighted: Rows | None = None
     """In units of what is left of each joint, where joints are weighed (`Pipeline.weighs`)."""
     held_out: Rows | None = None
@@ -140,8 +144,9 @@ def prepare(
     """
     if held_out is not None:
         check_held_out(pipeline, recording, held_out)
-        rows = regress(measure(pipeline, without_unknown_delay(pipeline, held_out)))[0]
-        return replace(prepare(pipeline, recording, alone), held_out=rows)
+        prepared = prepare(pipeline, recording, alone)
+        rows = regress(measure(prepared.pipeline, without_unknown_delay(pipeline, held_out)))[0]
+        return replace(prepared, held_out=rows)
     if not isinstance(recording, Recording):
         recording = join_recordings(recording, pipeline.gap)
     pipeline = pipeline.of_length(len(recording))
@@ -152,9 +157,26 @@ def prepare(
         return _prepare_pair(pipeline, pipeline.robot, recording, several)
     pipeline.check(recording)
     measured = measure(pipeline, recording)
+    if isinstance(pipeline.model, Chain) and pipeline.model.stribeck_unknown:
+        return _with_curves(measured, pipeline.model)
     if pipeline.once:
         return _prepared(measured, *regress(measured))
     return _prepared(measured, regress_in_windows(pipeline, recording, pipeline.model), column_noise(measured))
+
+
+def _with_curves(measured: Measured, model: Chain) -> Prepared:
+    """With Stribeck's curves that explain the recording best."""
+    if not measured.pipeline.ordinary:
+        raise ValueError(
+            "Stribeck's curves are looked for by ordinary least squares: leave out estimates and noise in [window], "
+            "and filter.mode"
+        )
+    curves = find_curves(measured.pipeline, measured.recording, regress(measured)[0])
+    found = model.with_stribeck(curves.velocity, curves.exponent)
+    note = curves.in_words(model.joint_names)
+    recording = replace(measured.recording, notes=(*measured.recording.notes, note))
+    other = replace(measured, recording=recording, pipeline=replace(measured.pipeline, model=found), model=found)
+    return replace(_prepared(other, *regress(other)), curves=curves)
 
 
 def check_held_out(pipeline: Pipeline, recording: Recording | Sequence[Recording], held_out: Recording) -> None:

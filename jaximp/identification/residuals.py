@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.identification.prepared import Prepared
 from jaximp.identification.rows import Rows
 from jaximp.types import Numbers
 
@@ -69,19 +68,3 @@ def _root_mean_square(left: Numbers, which: NDArray[np.bool_]) -> Numbers:
 def _share(left: Numbers, torque: Numbers, which: NDArray[np.bool_], axis: int | None) -> Numbers:
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(_squares(left, which, axis) / _squares(torque, which, axis)))
-
-
-def of_whole_recording(prepared: Prepared, theta: Numbers) -> Numbers:
-    """(p,) the parameters of the recording as one window, from `theta` (M, p) of its windows where that is one."""
-    if len(theta) == 1:
-        return np.asarray(theta[0])
-    p = theta.shape[1]
-    if prepared.weighted is not None:
-        W, torque = prepared.weighted.W, prepared.weighted.torque
-    elif len(prepared.white) == 1:
-        W, torque = prepared.white[0].W, prepared.white[0].torque
-    else:
-        W, torque = prepared.rows.W, prepared.rows.torque
-    counts = np.ravel(prepared.rows.valid)
-    W, torque = np.reshape(W, (-1, p))[counts], np.ravel(torque)[counts]
-    return np.asarray(np.linalg.lstsq(W, torque)[0])

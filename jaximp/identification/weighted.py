@@ -65,13 +65,14 @@ def weighted_fit(rows: Rows, weighted: Rows, place: Placement) -> SlidingFit:
     for k in np.flatnonzero(np.isfinite(np.asarray(fit.theta)).all(axis=1)).tolist():
         part = slice(place.starts[k], place.starts[k] + place.window)
         W, torque, counts = (np.asarray(x)[part] for x in (weighted.W, weighted.torque, rows.valid))
-        stderr[k], dof[k] = errors(W, torque, counts)
+        covariance, dof[k] = covariance_of(W, torque, counts)
+        stderr[k] = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     found = (stderr, dof, np.asarray(seen.vaf), np.asarray(seen.residual_rms))
     return eqx.tree_at(lambda f: (f.stderr, f.dof, f.vaf, f.residual_rms), fit, found)
 
 
-def errors(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tuple[Numbers, float]:
-    """Standard errors (p,) of least squares, and their degrees of freedom.
+def covariance_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tuple[Numbers, float]:
+    """Covariance (p, p) of least squares, and its degrees of freedom.
 
     **Arguments:** rows `W` (S, n, p) and `torque` (S, n) of one window, and which of them are `valid` (S, n).
     """
@@ -89,8 +90,8 @@ def errors(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tuple[Numbe
         spread += (1 - lag / (lags + 1)) * (together + together.T)
     inverse = np.linalg.inv(R)
     share = (lags + 1) / rows
-    variance = np.einsum("ij,jk,ik->i", inverse, spread, inverse) / (1 - share + share**2 / 3)
-    return np.sqrt(np.maximum(variance, 0)), min(1.5 / share, float(valid.sum() - p))
+    covariance = inverse @ spread @ inverse.T / (1 - share + share**2 / 3)
+    return covariance, min(1.5 / share, float(valid.sum() - p))
 
 
 def _bandwidth(left: Numbers, valid: NDArray[np.bool_]) -> int:

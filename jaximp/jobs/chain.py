@@ -56,10 +56,11 @@ class ChainSettings:
     """The URDF's position of each joint where the recorded one is zero [rad or m]."""
     sign: PerJoint = 1.0
     """-1 where the controller counts the other way than the URDF."""
-    stribeck_velocity: PerJoint = 0.1
-    """Velocity at which Stribeck's friction has fallen [rad/s or m/s]."""
+    stribeck_velocity: PerJoint | str = 0.1
+    """Velocity at which Stribeck's friction has fallen [rad/s or m/s]; or `"estimate"`: it and the exponent are then
+    those that explain the recording best."""
     stribeck_exponent: PerJoint = 2.0
-    """Exponent of Stribeck's curve."""
+    """Exponent of Stribeck's curve, where its velocity is given."""
     sign_width: PerJoint = 0.0
     """Velocity around which the sign of dry friction turns gradually [rad/s or m/s]; at zero it jumps, and near
     standstill it then follows the noise of the velocity."""
@@ -95,7 +96,8 @@ def _read(path: Path, changed: int, settings: str) -> Chain:
     given: dict[str, Any] = json.loads(settings)
     if given["gravity"] is None:
         del given["gravity"]
-    given["stribeck"] = given.pop("stribeck_velocity"), given.pop("stribeck_exponent")
+    velocity, exponent = given.pop("stribeck_velocity"), given.pop("stribeck_exponent")
+    given["stribeck"] = velocity if isinstance(velocity, str) else (velocity, exponent)
     width = given.pop("sign_width")
     chain = Chain.from_urdf(path, **given)
     return chain.with_sign_width(width) if width != 0 else chain

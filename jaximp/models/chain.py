@@ -71,7 +71,8 @@ class Chain(Model):
       `joints = coupling @ (motors / gear)`. With `side = "motor"` positions and torques are those of the motors, by
       `side = "joint"` those of the joints; friction and rotors are the motors' in both cases.
     - `zero` and `sign`: the URDF's joints are at `sign * position + zero`, and torques have the same sign.
-    - `stribeck`: velocity [rad/s or m/s] and exponent of Stribeck's curve, for friction that has it.
+    - `stribeck`: velocity [rad/s or m/s] and exponent of Stribeck's curve, for friction that has it; or `"estimate"`,
+      by which an identification looks for both first.
     - `min_velocity`: below it [rad/s or m/s] friction is not that of the model; `moving` tells such rows.
     - `rounding`: components of rotations and axes closer to zero are what the file rounded. Base columns are chosen
       with zeros in their place, or 1.5708 for a quarter turn would make a dozen columns that nothing excites. All
@@ -108,6 +109,8 @@ class Chain(Model):
     link_names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """The URDF's links of each body."""
     tip: str | None = eqx.field(static=True)
+    stribeck_unknown: bool = eqx.field(static=True)
+    """Whether `stribeck` is but a beginning, and is to be found."""
     terms: tuple[Term, ...] = eqx.field(static=True)
     """Of the friction."""
     rotor: bool = eqx.field(static=True)
@@ -131,7 +134,7 @@ class Chain(Model):
         side: str = "motor",
         zero: PerJoint = 0.0,
         sign: PerJoint = 1.0,
-        stribeck: tuple[PerJoint, PerJoint] = (0.1, 2.0),
+        stribeck: tuple[PerJoint, PerJoint] | str = (0.1, 2.0),
         min_velocity: PerJoint = 0.0,
         rounding: float = 1e-5,
         strict: bool = True,
@@ -154,6 +157,8 @@ class Chain(Model):
         joints = signs[:, None] * (drive if side == "motor" else np.eye(len(names)))
         self.motors = np.eye(len(names)) if side == "motor" else np.linalg.inv(drive)
         zeros = _per_joint("zero", zero, 0.0, names)
+        self.stribeck_unknown = isinstance(stribeck, str)
+        stribeck = _curve(stribeck, self.terms)
         self.stribeck = (
             _per_joint("velocity of stribeck", stribeck[0], 0.1, names, np.greater, "above zero"),
             _per_joint("exponent of stribeck", stribeck[1], 2.0, names, np.greater, "above zero"),
@@ -225,9 +230,16 @@ class Chain(Model):
         return eqx.tree_at(lambda chain: chain.width, self, jnp.asarray(given), is_leaf=lambda x: x is None)
 
     def with_stribeck(self, velocity: Num[ArrayLike, "*n"], exponent: Num[ArrayLike, "*n"]) -> Chain:
-        """The same with another Stribeck curve; the regressor is differentiable in both numbers."""
+        """The same with another Stribeck curve, which is known; the regressor is differentiable in both numbers."""
         curve = tuple(jnp.broadcast_to(jnp.asarray(x, float), (self.n_joints,)) for x in (velocity, exponent))
-        return eqx.tree_at(lambda chain: chain.stribeck, self, curve)
+        known = eqx.tree_at(lambda chain: chain.stribeck, self, curve)
+        object.__setattr__(known, "stribeck_unknown", False)  # a new object, which nobody else has yet
+        return known
+
+    def sign_of(self, speed: Num[AnyArray, "... n"]) -> Array:
+        """Sign of the motors' velocities, gradual where the model is smoothed."""
+        speed = jnp.asarray(speed)
+        return jnp.sign(speed) if self.width is None else _gradual_sign(speed, self.width, jnp)
 
     def moving(self, dq: Num[ArrayLike, "... n"]) -> Array:
         """(..., n) whether each joint's motor is at least at `min_velocity`, so that its row counts for friction."""
@@ -372,6 +384,17 @@ def _columns(
 def _gradual_sign(speed: AnyArray, width: AnyArray, xp: ModuleType) -> AnyArray:
     """Within the width of zero; it jumps where that is zero."""
     return xp.where(width > 0, xp.tanh(speed / xp.where(width > 0, width, 1)), xp.sign(speed))
+
+
+def _curve(given: tuple[PerJoint, PerJoint] | str, terms: Sequence[Term]) -> tuple[PerJoint, PerJoint]:
+    """Velocity and exponent of Stribeck's curve, or those to begin with where they are to be found."""
+    if not isinstance(given, str):
+        return given
+    if given != "estimate":
+        raise ValueError(f"stribeck is '{given}': give velocity and exponent of the curve, or \"estimate\"")
+    if not any(term.name == "stribeck_friction" for term in terms):
+        raise ValueError('stribeck = "estimate" needs friction that has a curve: add "stribeck" to friction')
+    return 0.1, 2.0
 
 
 def _per_joint(

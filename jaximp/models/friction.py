@@ -1,7 +1,8 @@
 """Friction of a robot's joints as rows of a table: what each model of it adds to the regressor.
 
 The names are those of Khalil and Dombre 2002, 9.2, and Armstrong-Hélouvry, Dupont and Canudas de Wit 1994 (Stribeck).
-All are linear in their parameters; the two of Stribeck's curve itself are given.
+All are linear in their parameters but for the two of Stribeck's curve, which are given, or found beforehand
+(`identification.stribeck`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class Term(NamedTuple):
     value: Callable[[Speed], AnyArray]
 
 
-def _stribeck(at: Speed) -> AnyArray:
+def stribeck(at: Speed) -> AnyArray:
+    """Of size one; the curve is `exp(-|velocity / at.stribeck[0]| ** at.stribeck[1])`."""
     velocity, exponent = at.stribeck
     ratio, where = abs(at.velocity) / velocity, at.xp.where
     # The power of zero has no slope along the exponent: what stands still is put in afterwards.
@@ -50,7 +52,7 @@ FRICTION: dict[str, tuple[Term, ...]] = {
         Term("coulomb_forward", "coulomb_friction", "max(sign(dq), 0)", lambda at: at.xp.maximum(at.sign, 0)),
         Term("coulomb_backward", "coulomb_friction", "min(sign(dq), 0)", lambda at: at.xp.minimum(at.sign, 0)),
     ),
-    "stribeck": (Term("stribeck_friction", "coulomb_friction", "sign(dq) exp(-|dq/v|^e)", _stribeck),),
+    "stribeck": (Term("stribeck_friction", "coulomb_friction", "sign(dq) exp(-|dq/v|^e)", stribeck),),
 }
 """Every model of friction: viscous, Coulomb's, Coulomb's with another size in each direction, and what Stribeck's curve
 adds to Coulomb's at small velocities."""

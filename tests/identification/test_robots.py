@@ -13,7 +13,7 @@ from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.identify import estimate
 from jaximp.identification.pipeline import Pipeline, WindowSettings
-from jaximp.identification.weighted import errors
+from jaximp.identification.weighted import covariance_of
 from jaximp.models import Chain
 from jaximp.recordings import recordings_from_mapping
 from jaximp.types import Recording
@@ -56,10 +56,12 @@ def test_errors_know_what_rows_have_in_common() -> None:
     W = np.concatenate([np.ones((400, 2, 1)), rng.normal(size=(400, 2, 2))], axis=-1)
     white, valid = rng.normal(size=(400, 2)), np.ones((400, 2), bool)
     textbook = np.sqrt(np.diagonal(np.linalg.inv(W.reshape(-1, 3).T @ W.reshape(-1, 3))))
-    np.testing.assert_allclose(errors(W, white, valid)[0], textbook, rtol=0.25)
+    of_white, dof = covariance_of(W, white, valid)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(of_white)), textbook, rtol=0.25)
     slow = np.repeat(rng.normal(size=(40, 2)), 10, axis=0)
-    assert errors(W, slow, valid)[0][0] > 2 * textbook[0]
-    assert errors(W, slow, valid)[1] < errors(W, white, valid)[1]
+    of_slow, fewer = covariance_of(W, slow, valid)
+    assert np.sqrt(of_slow[0, 0]) > 2 * textbook[0]
+    assert fewer < dof
 
 
 def test_joints_count_by_their_noise(chain: Chain, runs: list[Estimates]) -> None:

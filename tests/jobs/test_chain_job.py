@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ import pytest
 from command_line import jaximp
 from factories.chains import arrays, chain_in
 from jaximp.jobs import WindowJob, parse_job
+from jaximp.jobs.export import export_robot
+from jaximp.models import Chain
 
 JOB = """
 held_out = 0.25
@@ -66,6 +70,34 @@ def test_a_job_leads_to_a_report(folder: Path, capsys: pytest.CaptureFixture[str
     page = (out / "report.html").read_text()
     assert "Stands for" in page
     assert "Residuals of each joint" in page
+    assert "Parameters against the URDF" in page
+
+
+@pytest.mark.slow  # compiles the program of that length
+def test_a_robot_is_exported_with_its_identified_links(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    urdf = folder / "identified.urdf"
+    assert jaximp("export", folder / "job.toml", "--urdf", urdf) == 0
+    said = capsys.readouterr().out
+    assert "of 20 numbers the data determined" in said
+    assert "mass of link 1: " in said
+    with urdf.with_suffix(".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    chain = Chain.from_urdf(urdf)
+    np.testing.assert_allclose([float(row["value"]) for row in rows[:20]], chain.standard_parameters[:20], atol=1e-12)
+    truth = Chain.from_urdf(folder / "two_joints.urdf")
+    for row, own in zip(rows[:20], truth.standard_parameters, strict=False):
+        assert float(row["low"]) - 0.02 <= own <= float(row["high"]) + 0.02
+    assert jaximp("export", folder / "job.toml", "--urdf", urdf) == 1
+    assert "exists: choose another --urdf, or pass --force" in capsys.readouterr().err
+
+
+def test_only_robots_from_a_urdf_are_exported(folder: Path) -> None:
+    head = JOB.split("[model.robot]")[0].replace("held_out = 0.25", "")
+    job = parse_job(head + "[model]\nrobot = true\n[window]\nlength = 2\n", folder)
+    with pytest.raises(
+        ValueError, match=re.escape("only a robot from a URDF can be written as one: give [model.robot]")
+    ):
+        export_robot(job, folder / "no.urdf")
 
 
 def test_the_job_lists_its_files(folder: Path) -> None:
