@@ -71,10 +71,12 @@ def glitches(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
     usual = _usual_around(rough, level)
     for m in range(1, LONGEST_GLITCH + 1):
         first = suspected[(suspected >= margin) & (suspected < len(z) - m - margin)]
-        run = first[:, None] + np.arange(m)
-        ends, beside = z[run[:, [0, -1]]], z[first[:, None] + np.array([-1, m])]
         off, bend = _from_cubic(z, first, m)
         nearest = off[:, [0, -1]].min(axis=1)
+        bent = nearest > SMOOTH * bend  # which most samples are not
+        first, off, nearest = first[bent], off[bent], nearest[bent]
+        run = first[:, None] + np.arange(m)
+        ends, beside = z[run[:, [0, -1]]], z[first[:, None] + np.array([-1, m])]
         # Between two levels every sample lies on one of them.
         from_levels = np.abs(ends[:, :, None] - beside[:, None]).min(axis=(1, 2))
         # What lies between its neighbours may have been sampled late, and does no harm.
@@ -84,7 +86,7 @@ def glitches(x: Numbers, noise: float | None = None) -> NDArray[np.bool_]:
         wrong = (
             (known[first + m + 1] - known[first - 2] == m + 3)
             & (np.minimum(outside, nearest) > STANDS_OUT * usual(first))
-            & (nearest > SMOOTH * np.maximum(bend, rest))
+            & (nearest > SMOOTH * rest)
             & (from_levels > 0.5 * nearest)
             & ~found[run].any(axis=1)
         )

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -300,6 +301,7 @@ def test_force_command_and_handle_must_agree(enough: Path, case: str) -> None:
     assert identify_impedance(perturbed, unperturbed, KnownArm(GEOMETRY, ARM.inertia), "gomi_kawato").trusted
 
 
+@cache
 def movements_of(folder: Path) -> tuple[Trials, Trials | None, tuple[str, ...]]:
     trials = read_job(folder / "job.toml").trials
     assert trials is not None
