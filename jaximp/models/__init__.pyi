@@ -39,6 +39,7 @@ from .reflex import pathway_of as pathway_of
 from .reflex import reflex_gain as reflex_gain
 from .reflex import with_gain as with_gain
 from .rigid_body import KinematicTree as KinematicTree
+from .tip import TipImpedance as TipImpedance
 from .urdf import SIX_JOINT_ARM as SIX_JOINT_ARM
 from .urdf import Urdf as Urdf
 from .urdf import parse_urdf as parse_urdf

@@ -8,10 +8,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
+
+from jaximp.models.base_parameters import find_base
+from jaximp.types import Numbers
 
 MOTION = ("q", "dq", "ddq", "1")
 """Columns of one joint that are linear in its motion: position, velocity, acceleration, and a constant one."""
+FEWEST_ROWS = 1200
+"""Of random motions, by which it is told what columns depend on each other."""
 
 
 class Role(NamedTuple):
@@ -53,6 +59,11 @@ class Model(eqx.Module):
     def memory(self) -> int:
         """How many samples of the past a row needs. As many rows at the beginning of a recording are not known."""
         return 0
+
+    @property
+    def regroups(self) -> bool:
+        """Whether columns may be sums of several of another model's, so that `combine` must look at numbers."""
+        return False
 
     @property
     def sample_rate(self) -> float | None:
@@ -205,23 +216,35 @@ class Stacked(Model):
 class Combined(Model):
     """Two models whose equal columns are merged, so that all parameters can be told apart: eq. (11).
 
-    `merge` (p, p_first + p_second) of zeros and ones maps the parameters of both onto the merged ones,
-    `theta = merge @ concatenate([theta_first, theta_second])`.
+    `merge` (p, p_first + p_second) maps the parameters of both onto the merged ones,
+    `theta = merge @ concatenate([theta_first, theta_second])`. It is of zeros and ones, but where a robot's columns are
+    sums of several: these are told by random motions, and `sums` says what each parameter then stands for.
     """
 
     first: Model
     second: Model
     merge: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    sums: dict[str, str] = eqx.field(static=True)
+    """What each parameter stands for, by its name."""
+    _places: tuple[int, ...] = eqx.field(static=True)
+    """Of the columns that are kept among all."""
 
     def __init__(self, first: Model, second: Model):
         stacked = Stacked(first, second)
         self.first, self.second = first, second
-        kept = list(dict.fromkeys(stacked.columns))
-        self.columns = tuple(kept)
-        self.merge = tuple(tuple(float(column == other) for other in stacked.columns) for column in kept)
-        members = [[i for i, other in enumerate(stacked.columns) if other == column] for column in kept]
-        self.names = tuple("+".join(stacked.names[i] for i in group) for group in members)
-        self.units = tuple(stacked.units[group[0]] for group in members)
+        columns = list(dict.fromkeys(stacked.columns))
+        members = [[i for i, other in enumerate(stacked.columns) if other == column] for column in columns]
+        names = ["+".join(stacked.names[i] for i in group) for group in members]
+        merge = np.array([[float(column == other) for other in stacked.columns] for column in columns])
+        kept, self.sums = list(range(len(columns))), {name: name.replace("+", " + ") for name in names}
+        if first.regroups or second.regroups:
+            base = find_base(_rows(stacked)[:, [group[0] for group in members]], names)
+            merge, kept, self.sums = np.asarray(base.map) @ merge, list(base.kept), base.sums
+        self.merge = tuple(map(tuple, merge.tolist()))
+        self._places = tuple(members[k][0] for k in kept)
+        self.names = tuple(names[k] for k in kept)
+        self.columns = tuple(columns[k] for k in kept)
+        self.units = tuple(stacked.units[place] for place in self._places)
         self.label = ""
         self.n_joints = first.n_joints
 
@@ -229,7 +252,7 @@ class Combined(Model):
     def roles(self) -> tuple[Role, ...]:
         """Of merged parameters that of the first."""
         both = self.first.roles + self.second.roles
-        return tuple(both[row.index(1.0)] for row in self.merge)
+        return tuple(both[place] for place in self._places)
 
     @property
     def memory(self) -> int:
@@ -254,8 +277,7 @@ class Combined(Model):
         return self._kept(Stacked(self.first, self.second).observation_matrix(q, dq, ddq))
 
     def _kept(self, W: Array) -> Array:
-        stacked = self.first.columns + self.second.columns
-        return W[..., jnp.array([stacked.index(column) for column in self.columns])]
+        return W[..., jnp.array(self._places)]
 
 
 class Joints(Model):
@@ -320,8 +342,18 @@ class Joints(Model):
 
 
 def combine(first: Model, second: Model) -> Combined:
-    """Stack two models and merge the columns they share: Tout et al. 2023, eq. (11)."""
+    """Stack two models and merge the columns they share: Tout et al. 2023, eq. (11). See `Combined`."""
     return Combined(first, second)
+
+
+def _rows(model: Model) -> Numbers:
+    """(rows, p) of random motions, which tell what depends on each other."""
+    random, n = np.random.default_rng(0), model.n_joints
+    shape = (FEWEST_ROWS // n + 1, n) if n > 1 else (FEWEST_ROWS,)
+    fast = random.choice([-1.0, 1.0], shape) * 10 ** random.uniform(-2, 0.5, shape)
+    motion = (np.pi * random.uniform(-1, 1, shape), fast, random.uniform(-10, 10, shape))
+    with jax.enable_x64(True):
+        return np.asarray(model.observation_matrix(*motion), float).reshape(-1, len(model.names))
 
 
 def _pair(pair: Model, change: Callable[[Model], Model]) -> Model:

@@ -192,6 +192,15 @@ class Chain(Model):
         return hash((self._digest, self.names))
 
     @property
+    def digest(self) -> str:
+        """A few letters that differ between robots whose columns do."""
+        return self._digest
+
+    @property
+    def regroups(self) -> bool:
+        return True
+
+    @property
     def roles(self) -> tuple[Role, ...]:
         kinds = ["link_mass", *["first_moment"] * 3, *["link_inertia"] * 6] * self.tree.n_bodies
         roles = [Role(kind, (k // 10 + 1,)) for k, kind in enumerate(kinds)]

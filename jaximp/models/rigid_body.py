@@ -101,7 +101,7 @@ def forward_kinematics(
     tree: KinematicTree, q: Num[ArrayLike, "... n"]
 ) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
     """Where the tip is: rotation from its frame to the base's `(..., 3, 3)`, and position `(..., 3)` [m]."""
-    return over_samples(_pose_lanes, tree.n_joints, tree, q)
+    return over_samples(pose_lanes, tree.n_joints, tree, q)
 
 
 def jacobian(tree: KinematicTree, q: Num[ArrayLike, "... n"]) -> Float[Array, "... 6 n"]:
@@ -109,7 +109,7 @@ def jacobian(tree: KinematicTree, q: Num[ArrayLike, "... n"]) -> Float[Array, ".
 
     In the base's frame: `jacobian(tree, q) @ dq`. Zero in the columns of joints that do not move the tip.
     """
-    return over_samples(_jacobian_lanes, tree.n_joints, tree, q)
+    return over_samples(jacobian_lanes, tree.n_joints, tree, q)
 
 
 def inverse_dynamics(
@@ -184,12 +184,14 @@ def regressor_columns(
 # The same for motions (n, N) with the samples on the last axis, of what is returned as well.
 
 
-def _pose_lanes(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
+def pose_lanes(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
+    """`forward_kinematics` (3, 3, N) and (3, N)."""
     R, p = _tip(tree, *_poses(tree, q))
     return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(p)
 
 
-def _jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
+def jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
+    """`jacobian` (6, n, N)."""
     if tree.tip_body < 0:
         return jnp.zeros((6, *q.shape), q.dtype)
     axes = _axes(tree, q, jnp)
