@@ -13,7 +13,6 @@ from jaximp import signals
 from jaximp.identification.filter_settings import Filters, FilterSettings, design_filters
 from jaximp.models.arm import PlanarArm
 from jaximp.models.base import Model
-from jaximp.models.chain import Chain
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.precision import require_float64
 from jaximp.trust.limits import TrustLimits
@@ -106,19 +105,18 @@ class Pipeline:
     @property
     def ordinary(self) -> bool:
         """Whether the noise is estimated, but only the standard errors of ordinary least squares use it."""
-        usual = ESTIMATES[1] if isinstance(self.model, Chain) else ESTIMATES[0]
+        usual = ESTIMATES[1] if self.model.regroups else ESTIMATES[0]
         return self.whitens and (self.window.estimates or usual) == "ordinary"
 
     @property
     def weighs(self) -> bool:
         """Whether ordinary least squares of several joints weigh each by what is left of it."""
-        return self.ordinary and isinstance(self.model, Chain) and self.model.n_joints > 1
+        return self.ordinary and self.model.regroups and self.model.n_joints > 1
 
     @property
     def min_velocity(self) -> Numbers:
         """() or (n,): slower rows of a joint do not count [rad/s or m/s]."""
-        of_model = self.model.min_velocity if isinstance(self.model, Chain) else 0.0
-        return np.asarray(np.maximum(self.window.min_velocity, of_model))
+        return np.asarray(np.maximum(self.window.min_velocity, self.model.min_velocity))
 
     @property
     def whole(self) -> bool:
@@ -158,10 +156,10 @@ class Pipeline:
         """**Raises:** `ValueError` for a recording that is too short, of another sample rate, or in degrees, and for
         filters that its sample rate does not allow."""
         require_float64(recording.position)
-        if isinstance(self.model, Chain) and self.model.n_joints != recording.n_joints:
+        if self.model.regroups and self.model.n_joints != recording.n_joints:
             raise ValueError(
-                f"{self.model.robot} has {self.model.n_joints} joints, but the recording {recording.n_joints}: map a "
-                "column of position and torque for each, or lock the others"
+                f"the robot has {self.model.n_joints} joints, but the recording {recording.n_joints}: map a column of "
+                "position and torque for each, or lock the others"
             )
         duration = len(recording) / recording.sample_rate
         if round(self.window.length * recording.sample_rate) > len(recording):

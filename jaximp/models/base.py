@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -136,6 +136,11 @@ class Model(eqx.Module):
         motion = (jnp.concatenate([jnp.asarray(x)] * periods) for x in (q, dq, ddq))
         return model.observation_matrix(*motion)[-n:]
 
+    @property
+    def min_velocity(self) -> Any:
+        """() or (n,): slower rows of a joint say nothing of its friction [rad/s or m/s]."""
+        return 0.0
+
     def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
         """How fast what makes the friction of each joint moves, for joints that move at `dq`."""
         return jnp.abs(jnp.asarray(dq))
@@ -190,6 +195,17 @@ class Stacked(Model):
         return self.first.roles + self.second.roles
 
     @property
+    def regroups(self) -> bool:
+        return self.first.regroups or self.second.regroups
+
+    @property
+    def min_velocity(self) -> Any:
+        return jnp.maximum(self.first.min_velocity, self.second.min_velocity)
+
+    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
+        return self.first.speed(dq)
+
+    @property
     def memory(self) -> int:
         return max(self.first.memory, self.second.memory)
 
@@ -224,8 +240,7 @@ class Combined(Model):
     first: Model
     second: Model
     merge: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    sums: dict[str, str] = eqx.field(static=True)
-    """What each parameter stands for, by its name."""
+    _sums: tuple[tuple[str, str], ...] = eqx.field(static=True)
     _places: tuple[int, ...] = eqx.field(static=True)
     """Of the columns that are kept among all."""
 
@@ -236,11 +251,11 @@ class Combined(Model):
         members = [[i for i, other in enumerate(stacked.columns) if other == column] for column in columns]
         names = ["+".join(stacked.names[i] for i in group) for group in members]
         merge = np.array([[float(column == other) for other in stacked.columns] for column in columns])
-        kept, self.sums = list(range(len(columns))), {name: name.replace("+", " + ") for name in names}
+        kept, sums = list(range(len(columns))), {name: name.replace("+", " + ") for name in names}
         if first.regroups or second.regroups:
             base = find_base(_rows(stacked)[:, [group[0] for group in members]], names)
-            merge, kept, self.sums = np.asarray(base.map) @ merge, list(base.kept), base.sums
-        self.merge = tuple(map(tuple, merge.tolist()))
+            merge, kept, sums = np.asarray(base.map) @ merge, list(base.kept), base.sums
+        self.merge, self._sums = tuple(map(tuple, merge.tolist())), tuple(sums.items())
         self._places = tuple(members[k][0] for k in kept)
         self.names = tuple(names[k] for k in kept)
         self.columns = tuple(columns[k] for k in kept)
@@ -249,10 +264,26 @@ class Combined(Model):
         self.n_joints = first.n_joints
 
     @property
+    def sums(self) -> dict[str, str]:
+        """What each parameter stands for, by its name."""
+        return dict(self._sums)
+
+    @property
     def roles(self) -> tuple[Role, ...]:
         """Of merged parameters that of the first."""
         both = self.first.roles + self.second.roles
         return tuple(both[place] for place in self._places)
+
+    @property
+    def regroups(self) -> bool:
+        return self.first.regroups or self.second.regroups
+
+    @property
+    def min_velocity(self) -> Any:
+        return jnp.maximum(self.first.min_velocity, self.second.min_velocity)
+
+    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
+        return self.first.speed(dq)
 
     @property
     def memory(self) -> int:

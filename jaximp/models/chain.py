@@ -98,7 +98,7 @@ class Chain(Model):
     """Velocity [rad/s or m/s] and exponent of Stribeck's curve."""
     width: Array | None
     """(n,) velocity around which its sign changes gradually; None where the sign jumps."""
-    min_velocity: Float[AnyArray, " n"]
+    _min_velocity: Float[AnyArray, " n"]
     """Slower motion says nothing of friction [rad/s or m/s]."""
     robot: str = eqx.field(static=True)
     """Its name in the URDF."""
@@ -163,7 +163,7 @@ class Chain(Model):
             _per_joint("velocity of stribeck", stribeck[0], 0.1, names, np.greater, "above zero"),
             _per_joint("exponent of stribeck", stribeck[1], 2.0, names, np.greater, "above zero"),
         )
-        self.min_velocity = _per_joint("min_velocity", min_velocity, 0.0, names, np.greater_equal, "at least zero")
+        self._min_velocity = _per_joint("min_velocity", min_velocity, 0.0, names, np.greater_equal, "at least zero")
         self.width = None
 
         self.tip = _tip(robot, found, tip)
@@ -199,6 +199,10 @@ class Chain(Model):
     @property
     def regroups(self) -> bool:
         return True
+
+    @property
+    def min_velocity(self) -> Any:
+        return self._min_velocity
 
     @property
     def roles(self) -> tuple[Role, ...]:

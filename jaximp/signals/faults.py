@@ -26,6 +26,8 @@ BEYOND = 0.5
 """So far beyond a limit dynamics ask for, as a share of the scatter of what they leave of other samples."""
 FEWEST_VISITS, QUIET = 5, 0.3
 """To a limit that cuts off the noise as well: neighbours there differ by less than this share of the noise."""
+AWAY = 6.0
+"""So many times the noise below a limit a signal has left it."""
 EXACT = 5
 """Values that repeat to the last digit at the end of a signal's range and nowhere else."""
 FEWEST_UPDATES, LONGEST_HELD = 20, 64
@@ -156,13 +158,19 @@ def torque_limits(
     left = _beside_dynamics(torque, position.reshape(len(torque), -1), free, sample_rate)
     found = []
     for sign, at in crowds:
-        visits = int((np.diff(np.r_[False, at].astype(np.int8)) > 0).sum())
         # Of smooth peaks that a nonlinear joint makes there are few.
-        often = visits >= FEWEST_VISITS
+        often = _visits(sign * torque, at, level) >= FEWEST_VISITS
         asked = (often or np.ptp(torque[at]) == 0) and _asked_beyond(-sign * left, at, free)
         if asked or (often and _without_noise(torque, at, free, step)):
             found.append(Limit(float(np.median(torque[at])), at))
     return tuple(found)
+
+
+def _visits(x: Numbers, at: NDArray[np.bool_], level: float) -> int:
+    """How often a signal comes to its limit from clearly below it: noise alone leaves it and returns."""
+    away = x < x[at].min() - AWAY * level
+    known = at | away
+    return int((np.diff(np.r_[False, at[known]].astype(np.int8)) > 0).sum())
 
 
 def _without_noise(x: Numbers, at: NDArray[np.bool_], free: NDArray[np.bool_], step: float) -> bool:

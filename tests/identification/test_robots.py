@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factories.chains import chain_in, motion, recording, truth_of
+from factories.chains import RATE, TWO_JOINTS, chain_in, motion, recording, truth_of, urdf_in
+from factories.robots import joint, link
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.identify import estimate
 from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.weighted import covariance_of
-from jaximp.models import Chain
-from jaximp.recordings import recordings_from_mapping
+from jaximp.models import Chain, TipImpedance, combine
+from jaximp.recordings import recording_from_arrays, recordings_from_mapping
 from jaximp.types import Recording
 from paths import DATA
 
@@ -146,6 +147,25 @@ def test_windows_of_a_length_slide_over_a_chain(chain: Chain) -> None:
     assert len(found.end) == 4
     apart = (found.value - truth_of(chain)) / found.stderr
     assert 0.4 < np.sqrt((apart**2).mean()) < 1.7
+
+
+def test_a_human_holds_the_tip_of_a_robot(tmp_path: Path) -> None:
+    """Both are identified from one recording, each joint counted by what is left of it."""
+    hand = joint("wrist", "fore", "hand", "fixed", "0.02 0 0.25") + link("hand", 0.2)
+    path = urdf_in(tmp_path)
+    path.write_text(TWO_JOINTS.replace("</robot>", f"{hand}</robot>"), encoding="utf-8")
+    robot = Chain.from_urdf(path, tip="hand", friction=True)
+    model = combine(robot, TipImpedance(robot, "xz"))
+    human = [1.2, 0.8, 6.0, 9.0, 150.0, 90.0, 12.0, -8.0]  # masses, damping, stiffness, force
+    theta = np.concatenate([truth_of(robot), human])
+    truth = np.array(model.merge) @ theta
+    time, q, dq, ddq = motion(0, 30.0)
+    torque = np.asarray(model.observation_matrix(q, dq, ddq)) @ truth
+    noisy = recording_from_arrays(time, q, torque + 0.05 * np.random.default_rng(0).normal(size=q.shape))
+    found = estimate(Pipeline(RATE, model, filter=FILTER), noisy)[0]
+    assert np.abs((found.value[0] - truth) / found.stderr[0]).max() < 4
+    assert found["human.stiffness_x"].value[0] == pytest.approx(150, rel=0.05)
+    assert found.trusted_in("human.stiffness_x").all(), found.verdicts.reason
 
 
 def test_generalised_estimates_can_be_asked_for(chain: Chain) -> None:

@@ -85,6 +85,9 @@ ON = 5 * np.pi > TIME
 """For whole periods of three radians a second."""
 
 
+SLOW = 0.3 * np.sin(0.2 * np.pi * TIME)
+
+
 def held_positions() -> Numbers:
     """Steps of half a second between two angles, with a rest at each."""
     phase = np.clip((TIME % 2) / 0.5, 0, 1)
@@ -96,6 +99,7 @@ def held_positions() -> Numbers:
     ("position", "torque"),
     [
         pytest.param(joint(12)[0], joint(12)[1] + noise(0.05, 12), id="nothing"),
+        pytest.param(SLOW, 40 * SLOW - 150 * SLOW**3 + noise(0.05, 12), id="three peaks of a softening spring"),
         pytest.param(np.sin(3 * TIME), 20 * np.sin(3 * TIME), id="sine without noise"),
         pytest.param(held_positions(), 40 * held_positions() + noise(0.05, 13), id="a joint that is held"),
         pytest.param(
