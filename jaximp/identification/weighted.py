@@ -82,7 +82,7 @@ def covariance_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tupl
     y = np.where(valid, torque, 0).ravel()
     left = y - Q @ (Q.T @ y)
     error = left / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT))
-    lags = _bandwidth(left.reshape(valid.shape), valid)
+    lags = common_lags(left.reshape(valid.shape), valid)
     scores = (Q * error[:, None]).reshape(*valid.shape, p).sum(axis=1)
     spread = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -94,7 +94,7 @@ def covariance_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tupl
     return covariance, min(1.5 / share, float(valid.sum() - p))
 
 
-def _bandwidth(left: Numbers, valid: NDArray[np.bool_]) -> int:
+def common_lags(left: Numbers, valid: NDArray[np.bool_]) -> int:
     """Lags that count, by how much neighbouring residuals (S, n) have in common."""
     both = valid[1:] & valid[:-1]
     now, before = np.where(both, left[1:], 0), np.where(both, left[:-1], 0)

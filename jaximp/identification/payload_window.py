@@ -1,0 +1,307 @@
+"""A load that changes, weighed while the robot moves: the last seconds of a stream, sample by sample.
+
+The robot is known. What it leaves of the torque is summed in blocks of time, which are added and never taken off again:
+the window is the sum of the last blocks, so rounding cannot pile up. The scores of the blocks give standard errors
+that know what samples have in common over a block's time, corrected by each block's leverage as in `whole_fit`. Loads
+before and after each of four instants are compared, so that a load that changes inside of the window is noticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import ArrayLike, Float, Num
+
+from jaximp.identification.payload import KnownRobot, load_columns, require_end
+from jaximp.identification.quantities import Quantities, freedom
+from jaximp.identification.weighted import LEAST_LEFT
+from jaximp.models.chain import Chain
+from jaximp.models.spatial import PARAMETERS
+from jaximp.results import Parameter
+from jaximp.types import AnyArray
+
+BLOCKS = 20
+"""Of a window."""
+CHANCE = 1e-3
+"""Probability of a change where there is none, for each estimate."""
+KNOWN = 0.1
+"""Standard error, as a share of the largest load, up to which a parameter is known."""
+FILLED = 0.5
+"""Share of the window's blocks that must hold samples."""
+
+
+class WindowState(NamedTuple):
+    """Sums of the last blocks of time; all that the window remembers."""
+
+    information: Float[Array, "B 10 10"]
+    """Of the load's weighted columns."""
+    with_robot: Float[Array, "B 10 p"]
+    """Products of the load's columns and the robot's."""
+    with_torque: Float[Array, "B 10 n"]
+    """Products of the load's columns and the torque of each joint."""
+    rows: Float[Array, " B"]
+    """How many rows count."""
+    samples: Array
+    """() seen so far, valid or not."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedNow(Quantities):
+    """The load in the last seconds: ten parameters as those of `Payload`, NaN for what is not known."""
+
+    changed: bool
+    """Whether the load is another one before and after some instant inside of the window: then the estimate is a
+    mixture of both."""
+    changed_ago: float
+    """How long ago [s], to a fifth of the window; NaN without a change."""
+
+    @property
+    def mass(self) -> Parameter:
+        """[kg], with `value`, `stderr` and `interval()`."""
+        return self["load.mass"]
+
+
+class PayloadWindow:
+    """The load on the last link of a known robot over the last seconds.
+
+    ```python
+    weigh = PayloadWindow.of(identify_robot(pipeline, alone), window=4.0, rate=500.0)
+    state = weigh.start()
+    state = weigh.update(state, q, dq, ddq, torque)  # one sample (n,), or several (S, n)
+    weigh.estimate(state).mass
+    ```
+
+    **Arguments:**
+
+    - `chain`; its base parameters `theta` (p,) with their `covariance` (p, p), such as `identify_robot` gives.
+    - `window` [s] and `rate` of the samples [Hz]. The window ends with the last sample; what is older is forgotten in
+      steps of a twentieth.
+    - `size` (n,) of the noise of each torque, for the weights of the joints: one for all by default.
+    - `gain_covariance` (n, n) of the relative errors of the drives' gains, as `Recording.gain_covariance`; `by_joint`
+      (p, n) what the torques of each joint made of `theta`, where it comes from the same drives.
+    - `largest` load that is thought of [kg], and how far from the tip its mass may `reach` [m]. Both only hold what the
+      motion does not show: where nothing turns fast, mass and centre are found as if the inertia were known to be of
+      some `largest * reach^2`.
+
+    Samples that are not finite, and rows of joints slower than `chain.min_velocity`, do not count. Motion and torque
+    must have passed the same filter. A noise that remembers longer than a twentieth of the window makes standard errors
+    too small: take a longer window.
+
+    **Raises:** `ValueError` in one line for shapes that do not fit, and windows of fewer than twenty samples.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        theta: Num[AnyArray, " p"],
+        covariance: Num[AnyArray, "p p"],
+        window: float,
+        rate: float,
+        *,
+        size: Num[AnyArray, " n"] | None = None,
+        gain_covariance: Num[AnyArray, "n n"] | None = None,
+        by_joint: Num[AnyArray, "p n"] | None = None,
+        largest: float = 20.0,
+        reach: float = 0.3,
+    ):
+        n, p = chain.n_joints, len(chain.names)
+        if np.shape(theta) != (p,) or np.shape(covariance) != (p, p):
+            raise ValueError(
+                f"theta has the shape {np.shape(theta)} and covariance {np.shape(covariance)}: the chain has {p} base "
+                "parameters"
+            )
+        if not window * rate >= BLOCKS:
+            raise ValueError(
+                f"a window of {window:g} s has {window * rate:.3g} samples at {rate:g} Hz: it needs {BLOCKS} at least"
+            )
+        if not (largest > 0 and reach > 0):
+            raise ValueError(f"largest is {largest:g} kg and reach {reach:g} m: both must be above zero")
+        require_end(chain)
+        self.chain, self.window, self.rate = chain, window, rate
+        self._seconds = round(window * rate / BLOCKS) / rate
+        powers = largest * reach ** np.repeat([0, 1, 2], [1, 3, 6])
+        gains = np.zeros((n, n)) if gain_covariance is None else np.asarray(gain_covariance, float)
+        weights = np.ones(n) if size is None else 1 / np.asarray(size, float)
+        of_robot = np.zeros((p, n)) if by_joint is None else by_joint
+        known = _Known(*(jnp.asarray(x, float) for x in (theta, covariance, gains, of_robot, 1 / powers**2)))
+        rows = partial(_sample_rows, chain, jnp.asarray(weights), jnp.asarray(load_columns(chain)))
+        self._update: Callable[..., WindowState] = jax.jit(partial(_update, rows, round(window * rate / BLOCKS)))
+        self._estimate = jax.jit(partial(_estimate, known, round(window * rate / BLOCKS)))
+        self._empty = _Sums(jnp.zeros((10, 10)), jnp.zeros((10, p)), jnp.zeros((10, n)), jnp.zeros(()))
+        self._most = KNOWN * powers
+
+    @classmethod
+    def of(
+        cls, robot: KnownRobot, window: float, rate: float, largest: float = 20.0, reach: float = 0.3
+    ) -> PayloadWindow:
+        """For a robot by `identify_robot`."""
+        return cls(
+            robot.chain,
+            robot.theta,
+            robot.covariance,
+            window,
+            rate,
+            size=robot.size,
+            gain_covariance=robot.gain_covariance,
+            by_joint=robot.by_joint,
+            largest=largest,
+            reach=reach,
+        )
+
+    def start(self) -> WindowState:
+        """An empty window."""
+        information, robot, torque, rows = (jnp.zeros((BLOCKS, *x.shape)) for x in self._empty)
+        return WindowState(information, robot, torque, rows, jnp.zeros((), jnp.int32))
+
+    def update(
+        self,
+        state: WindowState,
+        q: Num[ArrayLike, "*S n"],
+        dq: Num[ArrayLike, "*S n"],
+        ddq: Num[ArrayLike, "*S n"],
+        torque: Num[ArrayLike, "*S n"],
+    ) -> WindowState:
+        """With one more sample (n,), or several (S, n), one after the other."""
+        return self._update(state, *(jnp.atleast_2d(jnp.asarray(x, float)) for x in (q, dq, ddq, torque)))
+
+    def estimate(self, state: WindowState) -> WeighedNow:
+        """The load in the window."""
+        from scipy.special import stdtrit
+
+        found = jax.tree.map(np.asarray, self._estimate(state))
+        covariance = found.own + found.inherited
+        dof = freedom((np.diagonal(found.own), found.dof), (np.diagonal(found.inherited), np.inf))
+        unknown = ~(np.sqrt(np.diagonal(covariance)) <= self._most) | (found.filled < FILLED)
+        theta = np.where(unknown, np.nan, found.theta)
+        covariance[unknown] = covariance[:, unknown] = np.nan
+        beyond = np.where(found.freedom > 0, found.apart / stdtrit(found.freedom, 1 - CHANCE / 2 / len(SPLITS)), 0)
+        best, changed = int(beyond.argmax()), bool(beyond.max() > 1) and not unknown[0]
+        ago = self._seconds * (BLOCKS - SPLITS[best]) if changed else np.nan
+        names, units = tuple(f"load.{name}" for name in PARAMETERS), tuple(PARAMETERS.values())
+        return WeighedNow(names, units, theta, covariance, np.where(unknown, np.nan, dof), changed, ago)
+
+
+SPLITS = tuple(BLOCKS * k // 5 for k in range(1, 5))
+"""Blocks before an instant at which the load may change."""
+
+
+class _Sums(NamedTuple):
+    """Of one sample or block, see `WindowState`."""
+
+    information: Array
+    with_robot: Array
+    with_torque: Array
+    rows: Array
+
+
+class _Known(NamedTuple):
+    """Beside the window."""
+
+    theta: Array
+    covariance: Array
+    gains: Array
+    by_joint: Array
+    """(p, n) what the torques of each joint made of `theta`."""
+    precision: Array
+    """(10,) of what the load is thought to be beforehand."""
+
+
+class _Estimate(NamedTuple):
+    theta: Array
+    own: Array
+    """(10, 10) covariance by the window's own scores, and what was thought beforehand."""
+    dof: Array
+    white: Array
+    """() variance of the mass if the noise were white, and of the size that weights take it for."""
+    inherited: Array
+    """(10, 10) of the robot and the gains."""
+    apart: Array
+    """(k,) masses before and after each instant, in standard errors."""
+    freedom: Array
+    """(k,) of this."""
+    filled: Array
+    """Share of the blocks that hold samples."""
+
+
+def _sample_rows(chain: Chain, weights: Array, columns: Array, *sample: Array) -> tuple[Array, Array, Array]:
+    """Weighted rows of robot (S, n, p) and load (S, n, 10), and torques (S, n); zero where they do not count."""
+    *motion, torque = sample
+    finite = jnp.stack([jnp.isfinite(x).all(axis=-1) for x in motion]).all(axis=0)[:, None] & jnp.isfinite(torque)
+    q, dq, ddq, torque = (jnp.nan_to_num(x, posinf=0, neginf=0) for x in sample)
+    counted = jnp.where(finite & chain.moving(dq), weights, 0)
+    robot = chain.regressor(*(x[:, 0] if chain.n_joints == 1 else x for x in (q, dq, ddq)))
+    robot = robot.reshape(*q.shape, -1) * counted[..., None]
+    return robot, robot @ columns, torque * counted
+
+
+def _update(rows: Callable[..., Any], samples: int, state: WindowState, *several: Array) -> WindowState:
+    def step(state: WindowState, one: tuple[Array, Array, Array]) -> tuple[WindowState, None]:
+        robot, load, torque = one
+        place = (state.samples // samples) % BLOCKS
+        new = _Sums(load.T @ load, load.T @ robot, load.T * torque, (jnp.abs(load).max(axis=1) > 0).sum())
+        begins = state.samples % samples == 0
+
+        def added(old: Array, more: Array) -> Array:
+            return old.at[place].set(jnp.where(begins, 0.0, old[place]) + more)
+
+        summed = {key: added(getattr(state, key), getattr(new, key)) for key in _Sums._fields}
+        return state._replace(**summed, samples=state.samples + 1), None
+
+    stepped: WindowState = lax.scan(step, state, rows(*several))[0]
+    return stepped
+
+
+def _estimate(known: _Known, samples: int, state: WindowState) -> _Estimate:
+    filled = (state.rows > 0).mean()
+    # From the oldest block to the newest, which may be filled in part.
+    newest = (state.samples - 1) // samples
+    blocks = _Sums(*(jnp.roll(x, -(newest + 1), axis=0) for x in state[:-1]))
+    whole = _fit(known, blocks, jnp.ones(BLOCKS))
+    before = jnp.arange(BLOCKS)[None, :] < jnp.array(SPLITS)[:, None]
+    masks = jnp.concatenate([before, ~before]).astype(blocks.rows.dtype)
+    parts = jax.vmap(partial(_fit, known, blocks))(masks)
+    # How much more the noise leaves than white noise of its size would, is one number for both sides.
+    (first, last), (white_first, white_last) = jnp.split(parts.theta[:, 0], 2), jnp.split(parts.white, 2)
+    (few, many), (dof_first, dof_last) = jnp.split(parts.own[:, 0, 0] / parts.white, 2), jnp.split(parts.dof[:, 0], 2)
+    freedom = dof_first + dof_last
+    inflation = (dof_first * few + dof_last * many) / freedom
+    apart = jnp.abs(first - last) / jnp.sqrt(inflation * (white_first + white_last))
+    return whole._replace(apart=apart, freedom=freedom, filled=filled)
+
+
+def _fit(known: _Known, blocks: _Sums, mask: Array) -> _Estimate:
+    """The load from the blocks that count, with errors by their scores."""
+    information, with_robot, with_torque = (jnp.tensordot(mask, x, 1) for x in blocks[:3])
+    root = jnp.sqrt(jnp.diagonal(information) + known.precision)
+    scale = 1 / jnp.outer(root, root)
+    L = jnp.linalg.cholesky((information + jnp.diag(known.precision)) * scale)
+    back = jax.scipy.linalg.solve_triangular(L, jnp.eye(10), lower=True).T / root[:, None]
+    by_joint = back @ back.T @ with_torque
+    imitated = back @ back.T @ with_robot
+    theta = by_joint.sum(axis=1) - imitated @ known.theta
+    scores = blocks.with_torque.sum(axis=2) - blocks.with_robot @ known.theta - blocks.information @ theta
+    # In coordinates in which the whole information is the identity.
+    leverage = back.T @ (blocks.information * mask[:, None, None]) @ back
+    values, axes = jnp.linalg.eigh(jnp.eye(10) - leverage)
+    correction = (axes / jnp.sqrt(jnp.maximum(values, LEAST_LEFT))[:, None, :]) @ axes.swapaxes(1, 2)
+    corrected = jnp.einsum("bij,bj->bi", correction, (scores * mask[:, None]) @ back)
+    of_prior = back @ (back.T * known.precision) @ back @ back.T
+    own = back @ (corrected.T @ corrected) @ back.T + of_prior
+    by_gain = by_joint - imitated @ known.by_joint
+    carried = by_gain @ known.gains @ by_gain.T + imitated @ known.covariance @ imitated.T
+    seen = jnp.einsum("bij,kj->bki", correction, back)
+    weighed = jnp.einsum("bij,bkj->bki", leverage, seen)
+    between = -jnp.einsum("bki,cki->kbc", weighed, weighed)
+    own_blocks = jnp.einsum("bki,bki->kb", seen, weighed)
+    between = between + own_blocks[:, :, None] * jnp.eye(len(mask))
+    dof = jnp.trace(between, axis1=1, axis2=2) ** 2 / (between**2).sum(axis=(1, 2))
+    nothing = jnp.zeros(())
+    white = ((back[0] @ back.T) @ information @ (back @ back[0])) + of_prior[0, 0]
+    return _Estimate(theta, own, dof, white, carried, nothing, nothing, nothing)
