@@ -3,7 +3,7 @@
 The robot is known. What it leaves of the torque is summed in blocks of time, which are added and never taken off again:
 the window is the sum of the last blocks, so rounding cannot pile up. The scores of the blocks give standard errors
 that know what samples have in common over a block's time, corrected by each block's leverage as in `whole_fit`. Loads
-before and after each of four instants are compared, so that a load that changes inside of the window is noticed.
+before and after each instant are compared, so that a load that changes inside of the window is noticed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class WeighedNow(Quantities):
     """Whether the load is another one before and after some instant inside of the window: then the estimate is a
     mixture of both."""
     changed_ago: float
-    """How long ago [s], to a fifth of the window; NaN without a change."""
+    """How long ago [s], to a twentieth of the window; NaN without a change."""
 
     @property
     def mass(self) -> Parameter:
@@ -188,7 +188,7 @@ class PayloadWindow:
         return WeighedNow(names, units, theta, covariance, np.where(unknown, np.nan, dof), changed, ago)
 
 
-SPLITS = tuple(BLOCKS * k // 5 for k in range(1, 5))
+SPLITS = tuple(range(3, BLOCKS - 2))
 """Blocks before an instant at which the load may change."""
 
 
@@ -218,8 +218,6 @@ class _Estimate(NamedTuple):
     own: Array
     """(10, 10) covariance by the window's own scores, and what was thought beforehand."""
     dof: Array
-    white: Array
-    """() variance of the mass if the noise were white, and of the size that weights take it for."""
     inherited: Array
     """(10, 10) of the robot and the gains."""
     apart: Array
@@ -263,45 +261,59 @@ def _estimate(known: _Known, samples: int, state: WindowState) -> _Estimate:
     # From the oldest block to the newest, which may be filled in part.
     newest = (state.samples - 1) // samples
     blocks = _Sums(*(jnp.roll(x, -(newest + 1), axis=0) for x in state[:-1]))
-    whole = _fit(known, blocks, jnp.ones(BLOCKS))
     before = jnp.arange(BLOCKS)[None, :] < jnp.array(SPLITS)[:, None]
     masks = jnp.concatenate([before, ~before]).astype(blocks.rows.dtype)
-    parts = jax.vmap(partial(_fit, known, blocks))(masks)
+    sides = jax.vmap(partial(_side, known, blocks))(masks)
+    (first, last), (white_first, white_last), (few, many), (of_first, of_last) = (jnp.split(x, 2) for x in sides)
     # How much more the noise leaves than white noise of its size would, is one number for both sides.
-    (first, last), (white_first, white_last) = jnp.split(parts.theta[:, 0], 2), jnp.split(parts.white, 2)
-    (few, many), (dof_first, dof_last) = jnp.split(parts.own[:, 0, 0] / parts.white, 2), jnp.split(parts.dof[:, 0], 2)
-    freedom = dof_first + dof_last
-    inflation = (dof_first * few + dof_last * many) / freedom
+    freedom = of_first + of_last
+    inflation = (of_first * few + of_last * many) / freedom
     apart = jnp.abs(first - last) / jnp.sqrt(inflation * (white_first + white_last))
-    return whole._replace(apart=apart, freedom=freedom, filled=filled)
+    return _fit(known, blocks)._replace(apart=apart, freedom=freedom, filled=filled)
 
 
-def _fit(known: _Known, blocks: _Sums, mask: Array) -> _Estimate:
-    """The load from the blocks that count, with errors by their scores."""
-    information, with_robot, with_torque = (jnp.tensordot(mask, x, 1) for x in blocks[:3])
+def _solved(known: _Known, information: Array, scores: Array) -> tuple[Array, Array]:
+    """(10,) the load that explains the products `scores` of its columns with what the robot leaves; and the matrix in
+    whose coordinates the information, with what was thought beforehand, is the identity."""
     root = jnp.sqrt(jnp.diagonal(information) + known.precision)
-    scale = 1 / jnp.outer(root, root)
-    L = jnp.linalg.cholesky((information + jnp.diag(known.precision)) * scale)
+    L = jnp.linalg.cholesky((information + jnp.diag(known.precision)) / jnp.outer(root, root))
     back = jax.scipy.linalg.solve_triangular(L, jnp.eye(10), lower=True).T / root[:, None]
-    by_joint = back @ back.T @ with_torque
-    imitated = back @ back.T @ with_robot
-    theta = by_joint.sum(axis=1) - imitated @ known.theta
-    scores = blocks.with_torque.sum(axis=2) - blocks.with_robot @ known.theta - blocks.information @ theta
-    # In coordinates in which the whole information is the identity.
-    leverage = back.T @ (blocks.information * mask[:, None, None]) @ back
+    return back @ (back.T @ scores), back
+
+
+def _side(known: _Known, blocks: _Sums, mask: Array) -> tuple[Array, Array, Array, Array]:
+    """Of the blocks on one side of an instant: the mass; its variance if the noise were white and of the size that the
+    weights take it for; how many times as much the scores say; and the degrees of freedom of this."""
+    left = blocks.with_torque.sum(axis=2) - blocks.with_robot @ known.theta
+    information = jnp.tensordot(mask, blocks.information, 1)
+    theta, back = _solved(known, information, mask @ left)
+    row = back @ back[0]
+    seen = blocks.information @ row
+    scores = (left - blocks.information @ theta) @ row
+    white = row @ information @ row
+    # What a block's white noise adds to the mass, less what the estimate took of it.
+    expected = mask @ (seen @ row - ((seen @ back) ** 2).sum(axis=1))
+    freedom = mask.sum() * expected / white
+    return theta[0], white + row @ (known.precision * row), mask @ scores**2 / expected, freedom
+
+
+def _fit(known: _Known, blocks: _Sums) -> _Estimate:
+    """The load from all blocks, with errors by their scores."""
+    information, with_robot, with_torque = (x.sum(axis=0) for x in blocks[:3])
+    left = blocks.with_torque.sum(axis=2) - blocks.with_robot @ known.theta
+    theta, back = _solved(known, information, left.sum(axis=0))
+    by_joint, imitated = back @ (back.T @ with_torque), back @ (back.T @ with_robot)
+    leverage = back.T @ blocks.information @ back
     values, axes = jnp.linalg.eigh(jnp.eye(10) - leverage)
     correction = (axes / jnp.sqrt(jnp.maximum(values, LEAST_LEFT))[:, None, :]) @ axes.swapaxes(1, 2)
-    corrected = jnp.einsum("bij,bj->bi", correction, (scores * mask[:, None]) @ back)
+    scores = jnp.einsum("bij,bj->bi", correction, (left - blocks.information @ theta) @ back)
     of_prior = back @ (back.T * known.precision) @ back @ back.T
-    own = back @ (corrected.T @ corrected) @ back.T + of_prior
+    own = back @ (scores.T @ scores) @ back.T + of_prior
     by_gain = by_joint - imitated @ known.by_joint
     carried = by_gain @ known.gains @ by_gain.T + imitated @ known.covariance @ imitated.T
-    seen = jnp.einsum("bij,kj->bki", correction, back)
-    weighed = jnp.einsum("bij,bkj->bki", leverage, seen)
-    between = -jnp.einsum("bki,cki->kbc", weighed, weighed)
-    own_blocks = jnp.einsum("bki,bki->kb", seen, weighed)
-    between = between + own_blocks[:, :, None] * jnp.eye(len(mask))
+    seen = jnp.einsum("bij,kj->kbi", correction, back)
+    weighed = jnp.einsum("bij,kbj->kbi", leverage, seen)
+    between = (seen * weighed).sum(axis=2)[:, :, None] * jnp.eye(BLOCKS) - weighed @ weighed.swapaxes(1, 2)
     dof = jnp.trace(between, axis1=1, axis2=2) ** 2 / (between**2).sum(axis=(1, 2))
     nothing = jnp.zeros(())
-    white = ((back[0] @ back.T) @ information @ (back @ back[0])) + of_prior[0, 0]
-    return _Estimate(theta, own, dof, white, carried, nothing, nothing, nothing)
+    return _Estimate(theta, own, dof, carried, nothing, nothing, nothing)
