@@ -65,6 +65,14 @@ class DriveGains(Quantities):
         each = np.sqrt(np.maximum(np.diagonal(relative) - common**2, 0))
         return {"common": 100 * common, "each": (100 * each).tolist()}
 
+    def in_words(self) -> list[str]:
+        """A line for each gain, and two for the `torque` of a job."""
+        error, rows = self.gain_error, zip(self.names, self.theta, *self.interval(), self.units, strict=True)
+        lines = [f"{name}: {value:.4g} {unit} ({low:.4g} to {high:.4g})" for name, value, low, high, unit in rows]
+        each = ", ".join(f"{one:.2g}" for one in np.atleast_1d(error["each"]))
+        gains = ", ".join(f"{one:.5g}" for one in self.theta)
+        return [*lines, f"gain = [{gains}]", f"gain_error = {{ common = {error['common']:.2g}, each = [{each}] }}"]
+
     def applied(self, recording: Recording) -> Recording:
         """A recording of currents as one of torques, which knows what is not known of the gains.
 
