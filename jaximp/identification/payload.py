@@ -11,7 +11,7 @@ manipulators*; Tout et al. 2023, II.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from jaximp.models.chain import Chain
 from jaximp.models.spatial import PARAMETERS, moved
 from jaximp.recordings.join import part_of
 from jaximp.results import Parameter
-from jaximp.types import Numbers, Recording, listed
+from jaximp.types import AnyArray, Numbers, Recording, listed
 
 LOAD_METHODS = {
     1: "the robot first, then the load from what is left of the torque",
@@ -104,12 +104,14 @@ class Payload(Quantities):
                 lines.append(f"{words}: {listed([n for n, yes in zip(names, those, strict=True) if yes])}")
         return [*lines, *self.notes]
 
-    def _derived(self, names: tuple[str, ...], units: tuple[str, ...], function: object) -> Quantities:
+    def _derived(
+        self, names: tuple[str, ...], units: tuple[str, ...], function: Callable[[AnyArray], AnyArray]
+    ) -> Quantities:
         """By the derivative along each of the ten, which a step of 1e-30 along the imaginary axis gives to all digits.
         Nothing is known of them where the mass may be zero."""
-        assert callable(function)
         x = self.theta if self.theta[0] > 2 * self.stderr[0] else np.full(10, np.nan)
-        slope = np.stack([np.imag(function(x + 1e-30j * one)) / 1e-30 for one in np.eye(10)], axis=1)
+        with np.errstate(invalid="ignore"):
+            slope = np.stack([np.imag(function(x + 1e-30j * one)) / 1e-30 for one in np.eye(10)], axis=1)
         slope = np.where(np.isnan(slope).any(axis=1)[:, None], np.nan, slope)
         covariance = slope @ np.nan_to_num(self.covariance) @ slope.T
         return Quantities(names, units, np.real(function(x)), covariance, np.full(len(names), np.nanmin(self.dof)))
@@ -415,10 +417,11 @@ def _of_gains(gains: Numbers | None, of_gains: float, whole: float) -> str:
     return f"the mass carries the gains' common scale, which is known to {100 * common_error(gains):.2g} %{better}"
 
 
-def _about_centre(x: Numbers) -> Numbers:
+def _about_centre(x: AnyArray) -> AnyArray:
+    """The inertia of real or complex parameters."""
     mass, (a, b, c) = x[0], x[1:4]
     shift = np.array([b**2 + c**2, -a * b, a**2 + c**2, -a * c, -b * c, a**2 + b**2])
-    return np.asarray(x[4:] - shift / mass)
+    return x[4:] - shift / mass
 
 
 def _spoken(of: Quantities, k: int, factor: float, unit: str) -> str:
