@@ -124,7 +124,7 @@ class KnownRobot(NamedTuple):
     theta: Numbers
     """(p,) base parameters, in the order of `chain.names`."""
     covariance: Numbers
-    """(p, p) without errors of the gains."""
+    """(p, p) without errors of the gains, for variances of a few sums: it may be singular."""
     size: Numbers
     """(n,) what the model leaves of each torque [N m or N]."""
     by_joint: Numbers

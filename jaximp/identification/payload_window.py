@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -129,12 +129,10 @@ class PayloadWindow:
         powers = largest * reach ** np.repeat([0, 1, 2], [1, 3, 6])
         gains = np.zeros((n, n)) if gain_covariance is None else np.asarray(gain_covariance, float)
         weights = np.ones(n) if size is None else 1 / np.asarray(size, float)
-        of_robot = np.zeros((p, n)) if by_joint is None else by_joint
-        known = _Known(*(jnp.asarray(x, float) for x in (theta, covariance, gains, of_robot, 1 / powers**2)))
-        rows = partial(_sample_rows, chain, jnp.asarray(weights), jnp.asarray(load_columns(chain)))
-        self._update: Callable[..., WindowState] = jax.jit(partial(_update, rows, round(window * rate / BLOCKS)))
-        self._estimate = jax.jit(partial(_estimate, known, round(window * rate / BLOCKS)))
-        self._empty = _Sums(jnp.zeros((10, 10)), jnp.zeros((10, p)), jnp.zeros((10, n)), jnp.zeros(()))
+        known = (theta, covariance, gains, np.zeros((p, n)) if by_joint is None else by_joint, 1 / powers**2)
+        self._known = _Known(*(jnp.asarray(x, float) for x in known))
+        self._weights = jnp.asarray(weights)
+        self._update, self._estimate = _programs(chain, round(window * rate / BLOCKS))
         self._most = KNOWN * powers
 
     @classmethod
@@ -157,7 +155,9 @@ class PayloadWindow:
 
     def start(self) -> WindowState:
         """An empty window."""
-        information, robot, torque, rows = (jnp.zeros((BLOCKS, *x.shape)) for x in self._empty)
+        n, p = self.chain.n_joints, len(self.chain.names)
+        shapes = (BLOCKS, 10, 10), (BLOCKS, 10, p), (BLOCKS, 10, n), (BLOCKS,)
+        information, robot, torque, rows = map(jnp.zeros, shapes)
         return WindowState(information, robot, torque, rows, jnp.zeros((), jnp.int32))
 
     def update(
@@ -169,13 +169,15 @@ class PayloadWindow:
         torque: Num[ArrayLike, "*S n"],
     ) -> WindowState:
         """With one more sample (n,), or several (S, n), one after the other."""
-        return self._update(state, *(jnp.atleast_2d(jnp.asarray(x, float)) for x in (q, dq, ddq, torque)))
+        return self._update(
+            self._weights, state, *(jnp.atleast_2d(jnp.asarray(x, float)) for x in (q, dq, ddq, torque))
+        )
 
     def estimate(self, state: WindowState) -> WeighedNow:
         """The load in the window."""
         from scipy.special import stdtrit
 
-        found = jax.tree.map(np.asarray, self._estimate(state))
+        found = jax.tree.map(np.asarray, self._estimate(self._known, state))
         covariance = found.own + found.inherited
         dof = freedom((np.diagonal(found.own), found.dof), (np.diagonal(found.inherited), np.inf))
         unknown = ~(np.sqrt(np.diagonal(covariance)) <= self._most) | (found.filled < FILLED)
@@ -188,6 +190,8 @@ class PayloadWindow:
         return WeighedNow(names, units, theta, covariance, np.where(unknown, np.nan, dof), changed, ago)
 
 
+NEIGHBOURS = ((1, 2 / 3), (2, 1 / 3))
+"""How much blocks so far apart count together where loads before and after an instant are compared (Bartlett)."""
 SPLITS = tuple(range(3, BLOCKS - 2))
 """Blocks before an instant at which the load may change."""
 
@@ -228,7 +232,7 @@ class _Estimate(NamedTuple):
     """Share of the blocks that hold samples."""
 
 
-def _sample_rows(chain: Chain, weights: Array, columns: Array, *sample: Array) -> tuple[Array, Array, Array]:
+def _sample_rows(chain: Chain, columns: Array, weights: Array, *sample: Array) -> tuple[Array, Array, Array]:
     """Weighted rows of robot (S, n, p) and load (S, n, 10), and torques (S, n); zero where they do not count."""
     *motion, torque = sample
     finite = jnp.stack([jnp.isfinite(x).all(axis=-1) for x in motion]).all(axis=0)[:, None] & jnp.isfinite(torque)
@@ -239,7 +243,14 @@ def _sample_rows(chain: Chain, weights: Array, columns: Array, *sample: Array) -
     return robot, robot @ columns, torque * counted
 
 
-def _update(rows: Callable[..., Any], samples: int, state: WindowState, *several: Array) -> WindowState:
+@lru_cache(maxsize=8)
+def _programs(chain: Chain, samples: int) -> tuple[Callable[..., WindowState], Callable[..., _Estimate]]:
+    """What is compiled for blocks of so many samples of a chain, whatever is known of it."""
+    rows = partial(_sample_rows, chain, jnp.asarray(load_columns(chain)))
+    return jax.jit(partial(_update, rows, samples)), jax.jit(partial(_estimate, samples))
+
+
+def _update(rows: Callable[..., Any], samples: int, weights: Array, state: WindowState, *several: Array) -> WindowState:
     def step(state: WindowState, one: tuple[Array, Array, Array]) -> tuple[WindowState, None]:
         robot, load, torque = one
         place = (state.samples // samples) % BLOCKS
@@ -252,23 +263,26 @@ def _update(rows: Callable[..., Any], samples: int, state: WindowState, *several
         summed = {key: added(getattr(state, key), getattr(new, key)) for key in _Sums._fields}
         return state._replace(**summed, samples=state.samples + 1), None
 
-    stepped: WindowState = lax.scan(step, state, rows(*several))[0]
+    stepped: WindowState = lax.scan(step, state, rows(weights, *several))[0]
     return stepped
 
 
-def _estimate(known: _Known, samples: int, state: WindowState) -> _Estimate:
+def _estimate(samples: int, known: _Known, state: WindowState) -> _Estimate:
     filled = (state.rows > 0).mean()
     # From the oldest block to the newest, which may be filled in part.
     newest = (state.samples - 1) // samples
     blocks = _Sums(*(jnp.roll(x, -(newest + 1), axis=0) for x in state[:-1]))
-    before = jnp.arange(BLOCKS)[None, :] < jnp.array(SPLITS)[:, None]
-    masks = jnp.concatenate([before, ~before]).astype(blocks.rows.dtype)
+    early = jnp.arange(BLOCKS)[None, :] < jnp.array(SPLITS)[:, None]
+    masks = jnp.concatenate([early, ~early]).astype(blocks.rows.dtype)
     sides = jax.vmap(partial(_side, known, blocks))(masks)
-    (first, last), (white_first, white_last), (few, many), (of_first, of_last) = (jnp.split(x, 2) for x in sides)
+    before, after = (_Side(*halves) for halves in zip(*(jnp.split(x, 2) for x in sides), strict=True))
     # How much more the noise leaves than white noise of its size would, is one number for both sides.
-    freedom = of_first + of_last
-    inflation = (of_first * few + of_last * many) / freedom
-    apart = jnp.abs(first - last) / jnp.sqrt(inflation * (white_first + white_last))
+    freedom = before.freedom + after.freedom
+    inflation = (before.freedom * before.inflation + after.freedom * after.inflation) / freedom
+    robot, gains = before.robot - after.robot, before.gains - after.gains
+    inherited = jnp.einsum("ki,ij,kj->k", robot, known.covariance, robot)
+    inherited += jnp.einsum("ki,ij,kj->k", gains, known.gains, gains)
+    apart = jnp.abs(before.mass - after.mass) / jnp.sqrt(inflation * (before.white + after.white) + inherited)
     return _fit(known, blocks)._replace(apart=apart, freedom=freedom, filled=filled)
 
 
@@ -281,20 +295,37 @@ def _solved(known: _Known, information: Array, scores: Array) -> tuple[Array, Ar
     return back @ (back.T @ scores), back
 
 
-def _side(known: _Known, blocks: _Sums, mask: Array) -> tuple[Array, Array, Array, Array]:
-    """Of the blocks on one side of an instant: the mass; its variance if the noise were white and of the size that the
-    weights take it for; how many times as much the scores say; and the degrees of freedom of this."""
+class _Side(NamedTuple):
+    """What the blocks on one side of an instant say of the mass."""
+
+    mass: Array
+    white: Array
+    """Its variance if the noise were white, and of the size that the weights take it for."""
+    inflation: Array
+    """How many times as much the scores say, of blocks and of neighbours."""
+    freedom: Array
+    robot: Array
+    """(p,) what errors of the robot add to it, and what those of gains do (n,)."""
+    gains: Array
+
+
+def _side(known: _Known, blocks: _Sums, mask: Array) -> _Side:
     left = blocks.with_torque.sum(axis=2) - blocks.with_robot @ known.theta
     information = jnp.tensordot(mask, blocks.information, 1)
     theta, back = _solved(known, information, mask @ left)
     row = back @ back[0]
     seen = blocks.information @ row
-    scores = (left - blocks.information @ theta) @ row
+    scores = mask * ((left - blocks.information @ theta) @ row)
     white = row @ information @ row
     # What a block's white noise adds to the mass, less what the estimate took of it.
     expected = mask @ (seen @ row - ((seen @ back) ** 2).sum(axis=1))
-    freedom = mask.sum() * expected / white
-    return theta[0], white + row @ (known.precision * row), mask @ scores**2 / expected, freedom
+    alone, together = scores @ scores, sum(2 * w * (scores[k:] @ scores[:-k]) for k, w in NEIGHBOURS)
+    inflation = jnp.maximum(alone, alone + together) / expected
+    robot = row @ jnp.tensordot(mask, blocks.with_robot, 1)
+    gains = row @ jnp.tensordot(mask, blocks.with_torque, 1) - robot @ known.by_joint
+    return _Side(
+        theta[0], white + row @ (known.precision * row), inflation, mask.sum() * expected / white, robot, gains
+    )
 
 
 def _fit(known: _Known, blocks: _Sums) -> _Estimate:

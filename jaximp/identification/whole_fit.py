@@ -23,15 +23,15 @@ from jaximp.types import Numbers
 
 SINGULAR = 1e-9
 """Share of a column that the others must leave."""
-FEWEST_BLOCKS, MOST_BLOCKS = 6, 100
-"""Blocks of time."""
+FEWEST_BLOCKS, MOST_BLOCKS = 12, 100
+"""Blocks of time: more than a load has parameters."""
 
 
 class Scatter(NamedTuple):
     """The covariance of least squares by blocks of time."""
 
     covariance: Numbers
-    """(p, p)"""
+    """(p, p), of no higher rank than there are blocks: for variances of a few sums, not to be inverted."""
     inverse: Numbers
     """(p, p) of the triangle of the rows."""
     leverage: Numbers
