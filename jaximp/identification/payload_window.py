@@ -169,9 +169,9 @@ class PayloadWindow:
         torque: Num[ArrayLike, "*S n"],
     ) -> WindowState:
         """With one more sample (n,), or several (S, n), one after the other."""
-        return self._update(
-            self._weights, state, *(jnp.atleast_2d(jnp.asarray(x, float)) for x in (q, dq, ddq, torque))
-        )
+        # Each operation on JAX's arrays outside of compiled code takes as long as a tenth of an update.
+        samples = (x if isinstance(x, Array) else np.asarray(x, float) for x in (q, dq, ddq, torque))
+        return self._update(self._weights, state, *(x.reshape(-1, self.chain.n_joints) for x in samples))
 
     def estimate(self, state: WindowState) -> WeighedNow:
         """The load in the window."""
