@@ -29,7 +29,7 @@ from jaximp.identification.payload import (
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.quantities import Quantities
 from jaximp.identification.rows import Rows
-from jaximp.identification.weighted import ROUNDS, SETTLED, sizes_of_joints
+from jaximp.identification.weighted import ROUNDS, SETTLED, sizes_of_joints, triangles_of
 from jaximp.identification.whole_fit import Scatter, require_rank, scatter
 from jaximp.models.chain import Chain
 from jaximp.types import Numbers, Recording
@@ -189,7 +189,7 @@ def _solve(rows: Rows, known: _Known) -> tuple[Numbers, Numbers, Numbers]:
 
     W, current, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
     n, P = current.shape[1], W.shape[-1]
-    triangles = [_triangle(np.column_stack([W[:, j], current[:, j]])[valid[:, j]]) for j in range(n)]
+    triangles = triangles_of(W, current, valid)
     count, least = valid.sum(axis=0), NOTHING_LEFT * np.array([np.linalg.norm(R[:, -1]) for R in triangles])
 
     def residuals(x: Numbers, size: Numbers) -> Numbers:
@@ -216,10 +216,6 @@ def _solve(rows: Rows, known: _Known) -> tuple[Numbers, Numbers, Numbers]:
         if np.abs(size / before - 1).max() < SETTLED:
             break
     return x[:P], np.exp(x[P:]), size
-
-
-def _triangle(rows: Numbers) -> Numbers:
-    return np.asarray(np.linalg.qr(rows)[1])
 
 
 def _start(triangles: Sequence[Numbers], known: _Known, size: Numbers) -> Numbers:

@@ -36,15 +36,22 @@ def sizes_of_joints(rows: Rows) -> Numbers:
     """(n,) root mean square of what the parameters of the whole recording leave of each torque; one where nothing is
     left."""
     W, torque, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
-    size = np.ones(torque.shape[1])
+    triangles, size = triangles_of(W, torque, valid), np.ones(torque.shape[1])
     for _ in range(ROUNDS):
-        theta = np.linalg.lstsq((W / size[:, None])[valid], (torque / size)[valid])[0]
-        left = np.where(valid, torque - W @ theta, 0)
-        before, size = size, np.sqrt((left**2).sum(axis=0) / np.maximum(valid.sum(axis=0), 1))
+        stacked = np.concatenate([R / s for R, s in zip(triangles, size, strict=True)])
+        theta = np.linalg.lstsq(stacked[:, :-1], stacked[:, -1])[0]
+        left = np.array([np.linalg.norm(R[:, -1] - R[:, :-1] @ theta) for R in triangles])
+        before, size = size, left / np.sqrt(np.maximum(valid.sum(axis=0), 1))
         size = np.where(size > 1e-9 * np.abs(torque).max(initial=0.0), size, 1.0)
         if np.abs(size / before - 1).max() < SETTLED:
             break
     return size
+
+
+def triangles_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> list[Numbers]:
+    """All that least squares needs of each joint's rows: the triangle of its columns and torque, at most (p + 1, p + 1)."""
+    whole = np.concatenate([W, torque[..., None]], axis=-1)
+    return [np.asarray(np.linalg.qr(whole[valid[:, j], j])[1]) for j in range(torque.shape[1])]
 
 
 def by_size(rows: Rows, size: Numbers) -> Rows:
