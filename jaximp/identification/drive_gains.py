@@ -63,7 +63,7 @@ class DriveGains(Quantities):
         relative = self.relative_covariance
         common = common_error(relative)
         each = np.sqrt(np.maximum(np.diagonal(relative) - common**2, 0))
-        return {"common": 100 * common, "each": (100 * each).tolist()}
+        return {"common": float(100 * common), "each": (100 * each).tolist()}
 
     def in_words(self) -> list[str]:
         """A line for each gain, and two for the `torque` of a job."""

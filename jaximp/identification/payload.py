@@ -63,6 +63,8 @@ class Payload(Quantities):
     """(n,) root mean square of what robot and load leave of each torque [N m or N]."""
     notes: tuple[str, ...]
     """What is to be known of the estimate, in words."""
+    recording_notes: tuple[str, ...]
+    """What reading the recordings changed or noticed."""
 
     @property
     def mass(self) -> Parameter:
@@ -114,7 +116,9 @@ class Payload(Quantities):
             slope = np.stack([np.imag(function(x + 1e-30j * one)) / 1e-30 for one in np.eye(10)], axis=1)
         slope = np.where(np.isnan(slope).any(axis=1)[:, None], np.nan, slope)
         covariance = slope @ np.nan_to_num(self.covariance) @ slope.T
-        return Quantities(names, units, np.real(function(x)), covariance, np.full(len(names), np.nanmin(self.dof)))
+        used = self.dof[np.isfinite(slope).all(axis=1) @ (np.nan_to_num(slope) != 0) > 0]
+        dof = np.full(len(names), np.min(np.nan_to_num(used, nan=np.inf), initial=np.inf))
+        return Quantities(names, units, np.real(function(x)), covariance, dof)
 
 
 class KnownRobot(NamedTuple):
@@ -391,10 +395,9 @@ def _payload(
     theta[unknown] = covariance[unknown] = covariance[:, unknown] = np.nan
     gain_stderr = np.where(unknown, np.nan, np.sqrt(np.maximum(np.diagonal(of_gains), 0)))
     notes = [LOAD_METHODS[method], *found.notes, _of_gains(gains, gain_stderr[0], np.sqrt(covariance[0, 0]))]
-    for one in (*without, *with_load):
-        notes += [f"{one.name}: {note}" for note in one.notes]
+    noticed = tuple(f"{one.name}: {note}" for one in (*without, *with_load) for note in one.notes)
     names, units = tuple(f"load.{name}" for name in PARAMETERS), tuple(PARAMETERS.values())
-    of_load = (chain.tip, method, gains, gain_stderr, found.left, tuple(notes))
+    of_load = (chain.tip, method, gains, gain_stderr, found.left, tuple(notes), noticed)
     return Payload(names, units, theta, covariance, np.where(unknown, np.nan, dof), *of_load)
 
 

@@ -49,7 +49,7 @@ def sizes_of_joints(rows: Rows) -> Numbers:
 
 
 def triangles_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> list[Numbers]:
-    """All that least squares needs of each joint's rows: the triangle of its columns and torque, at most (p + 1, p + 1)."""
+    """What least squares needs of each joint's rows: the triangle of its columns and torque, at most (p + 1, p + 1)."""
     whole = np.concatenate([W, torque[..., None]], axis=-1)
     return [np.asarray(np.linalg.qr(whole[valid[:, j], j])[1]) for j in range(torque.shape[1])]
 

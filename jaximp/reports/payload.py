@@ -18,7 +18,7 @@ def write_load(folder: str | Path, found: Payload | DriveGains) -> None:
     standard error, and all in words. What is not determined is null."""
     content: dict[str, Any] = {"words": found.in_words(), "parameters": _table(found)}
     if isinstance(found, Payload):
-        content |= {"frame": found.frame, "method": found.method}
+        content |= {"frame": found.frame, "method": found.method, "recordings": found.recording_notes}
         content["determined"] = dict(zip(found.names, found.determined.tolist(), strict=True))
         content["parameters"] |= _table(found.centre) | _table(found.inertia_about_centre)
     else:
