@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Num
 
+from jaximp.identification.block_errors import Scatter, require_rank, scatter
 from jaximp.identification.payload import (
     Several,
     TenParameters,
@@ -30,7 +31,6 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.quantities import Quantities
 from jaximp.identification.rows import Rows
 from jaximp.identification.weighted import ROUNDS, SETTLED, sizes_of_joints, triangles_of
-from jaximp.identification.whole_fit import Scatter, require_rank, scatter
 from jaximp.models.chain import Chain
 from jaximp.types import Numbers, Recording
 

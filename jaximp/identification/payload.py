@@ -2,7 +2,7 @@
 
 A load that is fixed to the last link has ten inertial parameters, and its columns are those of the last link: what it
 adds to the base parameters of the robot is `B` times the ten. Methods 1 to 4 tell it from the robot. Standard errors
-come from the scores, with all that they have in common over time (`whole_fit`). They hold what is not known of the
+come from the scores, with all that they have in common over time (`block_errors`). They hold what is not known of the
 robot and of the gains behind the torques.
 
 **Source:** Khalil, Gautier and Lemoine 2007, *Identification of the payload inertial parameters of industrial
@@ -18,11 +18,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximp.identification.block_errors import SINGULAR, BlockFit, block_fit, of_each
 from jaximp.identification.pipeline import Pipeline
+from jaximp.identification.prepared import without_unknown_delay
 from jaximp.identification.quantities import Quantities, freedom
 from jaximp.identification.rows import Rows, measure, regress
 from jaximp.identification.separation import OTHER_MOTION
-from jaximp.identification.whole_fit import SINGULAR, WholeFit, of_each, whole_fit
 from jaximp.models.chain import Chain
 from jaximp.models.spatial import PARAMETERS, moved
 from jaximp.recordings.join import part_of
@@ -143,7 +144,7 @@ def identify_robot(pipeline: Pipeline, alone: Several) -> KnownRobot:
     **Raises:** `ValueError` as `identify_payload`.
     """
     chain, several = required_chain(pipeline), listed_recordings(alone)
-    fit = whole_fit(rows_of(pipeline, several))
+    fit = block_fit(rows_of(pipeline, several))
     return KnownRobot(chain, fit.theta, fit.scatter.covariance, fit.size, fit.by_joint, gains_of(several))
 
 
@@ -171,11 +172,11 @@ def identify_payload(pipeline: Pipeline, alone: Several, loaded: Several, method
     empty, full = (rows_of(pipeline, several) for several in (without, with_load))
     ten = TenParameters.of(np.asarray(full.W), full.valid, columns)
     if method == 1:
-        found = _robot_first(ten, whole_fit(empty), full)
+        found = _robot_first(ten, block_fit(empty), full)
     elif method == 2:
-        found = _difference_of_parameters(chain, ten, whole_fit(empty), full)
+        found = _difference_of_parameters(chain, ten, block_fit(empty), full)
     elif method == 3:
-        found = _same_motion(pipeline, ten, whole_fit(empty), without, with_load)
+        found = _same_motion(pipeline, ten, block_fit(empty), without, with_load)
     else:
         found = _together(ten, empty, full)
     return _payload(chain, method, ten, found, gains, without, with_load)
@@ -189,6 +190,10 @@ def required_chain(pipeline: Pipeline) -> Chain:
     chain = pipeline.model
     if not isinstance(chain, Chain):
         raise ValueError("a payload is that of a robot from a URDF: give a pipeline whose model is a Chain")
+    if chain.stribeck_unknown:
+        raise ValueError("Stribeck's curves are not looked for beside a load: identify the robot alone, and give them")
+    if not pipeline.once:
+        raise ValueError("a load is identified from whole recordings: leave out filter.mode, or set it to 'once'")
     require_end(chain)
     return chain
 
@@ -212,7 +217,7 @@ def rows_of(pipeline: Pipeline, several: Sequence[Recording]) -> Rows:
     for one in several:
         own = pipeline.of_length(len(one))
         own.check(one)
-        parts.append(regress(measure(own, one))[0])
+        parts.append(regress(measure(own, without_unknown_delay(own, one)))[0])
     joined = [np.concatenate([np.asarray(getattr(part, key)) for part in parts]) for key in ("W", "torque", "valid")]
     shape = joined[1].shape[0], -1
     W, torque, valid = (
@@ -274,7 +279,7 @@ class _Found(NamedTuple):
 
     u: Numbers
     """(d,)"""
-    sources: tuple[tuple[Numbers, WholeFit], ...]
+    sources: tuple[tuple[Numbers, BlockFit], ...]
     """The fits whose errors it has, each with rows (d, p): what the fit's parameters add to `u`."""
     by_joint: Numbers
     """(d, n) what the torques of each joint make of it by themselves; they add up to `u`."""
@@ -283,26 +288,26 @@ class _Found(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def _robot_first(ten: TenParameters, robot: WholeFit, full: Rows) -> _Found:
+def _robot_first(ten: TenParameters, robot: BlockFit, full: Rows) -> _Found:
     return _from_the_rest(full.W @ ten.columns, full, full.W, robot)
 
 
-def _from_the_rest(load: Numbers, rows: Rows, robots: Numbers, robot: WholeFit, notes: tuple[str, ...] = ()) -> _Found:
+def _from_the_rest(load: Numbers, rows: Rows, robots: Numbers, robot: BlockFit, notes: tuple[str, ...] = ()) -> _Found:
     """The load from what the robot's model leaves of a torque.
 
     **Arguments:** columns of the `load` (S, n, d); `rows` whose torque is explained; columns of the robot (S, n, p).
     """
     torque = np.asarray(rows.torque)
-    fit = whole_fit(Rows(load, torque - robots @ robot.theta, rows.valid, rows.time))
+    fit = block_fit(Rows(load, torque - robots @ robot.theta, rows.valid, rows.time))
     imitated = fit.solve(robots)
     by_joint = fit.solve(of_each(torque)) - imitated @ robot.by_joint
     sources = (np.eye(len(fit.theta)), fit), (-imitated, robot)
     return _Found(fit.theta, sources, by_joint, fit.size, notes)
 
 
-def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: WholeFit, full: Rows) -> _Found:
+def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: BlockFit, full: Rows) -> _Found:
     """By the links' parameters alone: a load changes friction, too, and nobody knows how."""
-    with_load = whole_fit(full)
+    with_load = block_fit(full)
     links = np.array([not name.startswith("joint") or name.endswith("rotor_inertia") for name in chain.names])
     spread = sum(np.linalg.inv(fit.information)[np.ix_(links, links)] for fit in (robot, with_load))
     columns = ten.columns[links]
@@ -314,7 +319,7 @@ def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: WholeFit,
 
 
 def _same_motion(
-    pipeline: Pipeline, ten: TenParameters, robot: WholeFit, without: list[Recording], with_load: list[Recording]
+    pipeline: Pipeline, ten: TenParameters, robot: BlockFit, without: list[Recording], with_load: list[Recording]
 ) -> _Found:
     if len(without) > 1 or len(with_load) > 1:
         raise ValueError("method 3 compares two recordings of one motion: give one without and one with the load")
@@ -360,7 +365,7 @@ def _together(ten: TenParameters, empty: Rows, full: Rows) -> _Found:
     torque, valid, time = (
         np.concatenate([getattr(x, key) for x in (empty, full)]) for key in ("torque", "valid", "time")
     )
-    fit = whole_fit(Rows(W, torque, valid, time))
+    fit = block_fit(Rows(W, torque, valid, time))
     of_load = np.eye(W.shape[-1])[empty.W.shape[-1] :]
     return _Found(of_load @ fit.theta, ((of_load, fit),), of_load @ fit.by_joint, fit.size)
 

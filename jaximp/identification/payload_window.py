@@ -1,8 +1,8 @@
 """A load that changes, weighed while the robot moves: the last seconds of a stream, sample by sample.
 
 The robot is known. What it leaves of the torque is summed in blocks of time, which are added and never taken off again:
-the window is the sum of the last blocks, so rounding cannot pile up. The scores of the blocks give standard errors
-that know what samples have in common over a block's time, corrected by each block's leverage as in `whole_fit`. Loads
+the window is the sum of the last blocks, so rounding cannot pile up. The scores of the blocks give standard errors that
+know what samples have in common over a block's time, corrected by each block's leverage as in `block_errors`. Loads
 before and after each instant are compared, so that a load that changes inside of the window is noticed.
 """
 

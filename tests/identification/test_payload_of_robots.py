@@ -13,8 +13,8 @@ from scipy.linalg import sqrtm
 from factories.chains import FRICTION, TWO_JOINTS, motion, with_load
 from factories.real_robots import PENDULUM
 from jaximp.identification import FilterSettings, Payload, Pipeline, identify_gains, identify_payload, identify_robot
+from jaximp.identification.block_errors import scatter
 from jaximp.identification.payload import LOAD_METHODS, load_columns
-from jaximp.identification.whole_fit import scatter
 from jaximp.models import SIX_JOINT_ARM, Chain, HumanJoint, parse_urdf, rigid_body
 from jaximp.models.spatial import about, moved, pseudo_inertia
 from jaximp.recordings import recording_from_arrays, recordings_from_mapping
@@ -232,6 +232,11 @@ def test_bad_input_is_refused() -> None:
         identify_payload(PIPELINE, alone, loaded, 5)
     with pytest.raises(ValueError, match="whose model is a Chain"):
         identify_payload(Pipeline(100.0, HumanJoint()), alone, loaded)
+    with pytest.raises(ValueError, match=r"leave out filter\.mode"):
+        identify_payload(replace(PIPELINE, filter=replace(FILTER, mode="window")), alone, loaded)
+    unknown = Chain(parse_urdf(TWO_JOINTS), friction=["coulomb", "stribeck"], stribeck="estimate")
+    with pytest.raises(ValueError, match="Stribeck's curves are not looked for"):
+        identify_payload(replace(PIPELINE, model=unknown), alone, loaded)
     with pytest.raises(ValueError, match="the load pulls upwards"):
         identify_gains(PIPELINE, loaded, alone, 0.7)
     with pytest.raises(ValueError, match="mass is 0"):

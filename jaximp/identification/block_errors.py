@@ -52,7 +52,7 @@ class Scatter(NamedTuple):
             return np.asarray(total**2 / (between**2).sum(axis=(1, 2)))
 
 
-class WholeFit(NamedTuple):
+class BlockFit(NamedTuple):
     """Parameters of all rows."""
 
     theta: Numbers
@@ -68,7 +68,7 @@ class WholeFit(NamedTuple):
     """(p, k) the parameters of other torques (S, n, k) of the same rows, with the same weights."""
 
 
-def whole_fit(rows: Rows) -> WholeFit:
+def block_fit(rows: Rows) -> BlockFit:
     """**Raises:** `ValueError` where the rows do not determine all parameters."""
     size, valid = sizes_of_joints(rows), np.asarray(rows.valid)
     weighted = by_size(rows, size)
@@ -80,7 +80,7 @@ def whole_fit(rows: Rows) -> WholeFit:
         return np.asarray(np.linalg.solve(R, Q.T @ counted.reshape(len(Q), -1)))
 
     by_joint = solve(of_each(np.asarray(rows.torque)))
-    return WholeFit(by_joint.sum(axis=1), scatter(weighted.W, weighted.torque, valid), size, R.T @ R, by_joint, solve)
+    return BlockFit(by_joint.sum(axis=1), scatter(weighted.W, weighted.torque, valid), size, R.T @ R, by_joint, solve)
 
 
 def of_each(torque: Numbers) -> Numbers:
