@@ -25,6 +25,7 @@ from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.chain import ChainSettings
 from jaximp.jobs.design import DesignSettings, EncoderSettings
 from jaximp.jobs.job import HumanSettings, ModelSettings, ReflexSettings, RobotSettings, WindowJob
+from jaximp.jobs.payload import PayloadSettings
 from jaximp.jobs.trials import STATIC_WINDOW, HandleSettings, TrialsSettings, TriggerSettings
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
@@ -77,6 +78,12 @@ RECORDING_JOB = (
         ArmSettings,
         "An arm of two joints in a plane. It stands alone: without human and robot.",
         hidden=OF_HAND,
+    ),
+    Table(
+        "[payload]",
+        PayloadSettings,
+        "A load at the end of a robot with a URDF: `[recording]` is with it, `[robot_recording]` without. See "
+        "[payload](payload.md).",
     ),
     Table("[filter]", FilterSettings, "Filters of position and torque, all run forward and backward."),
     Table("[window]", WindowSettings),
@@ -191,8 +198,9 @@ def recording() -> Iterator[str]:
     yield "### [recording], [robot_recording] and [robot_recording_after]\n"
     yield (
         "Where the measurements are: `file`, a path that begins at the job's folder, and the columns. "
-        "`[robot_recording]` has the same keys, and is the recording of the robot alone. `[robot_recording_after]` has "
-        "them too, and is a second one, made after the recording with the human: it tells how far the robot changed. "
+        "`[robot_recording]` has the same keys, and is the recording of the robot alone, without a human or a load. "
+        "`[robot_recording_after]` has them too, and is a second one, made after the recording with the human: it "
+        "tells how far the robot changed. "
         "Of `[recording]` alone, `file` may be a list of files with the same columns (and `rows` a list of pairs), or "
         "there may be several `[[recording]]` tables: they are identified together, and no filter crosses from one "
         "into the next.\n"

@@ -335,10 +335,12 @@ def why_alone(job: WindowJob) -> str:
 def of_recordings(job: Job) -> WindowJob:
     """The job, if it is one for many recordings.
 
-    **Raises:** `ValueError` for a job with trials.
+    **Raises:** `ValueError` for a job with trials, and for one with a payload.
     """
     if isinstance(job, TrialsJob):
         raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
+    if job.payload is not None:
+        raise ValueError("a job with [payload] is about one pair of recordings: run `jaximp identify` on it")
     return job
 
 

@@ -1,3 +1,5 @@
+from .bodies import RealBody as RealBody
+from .bodies import nearest_body as nearest_body
 from .cone import Cone as Cone
 from .cone import cone_of as cone_of
 from .export import Exported as Exported

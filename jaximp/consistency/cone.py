@@ -172,7 +172,6 @@ def pose(chain: Chain, estimate: Num[AnyArray, " p"], covariance: Num[AnyArray, 
 
     **Raises:** `ValueError` for shapes that do not fit, and a covariance that is not positive definite.
     """
-    cone = cone_of(chain)
     theta, C = np.asarray(estimate, float), np.asarray(covariance, float)
     p = len(chain.names)
     if theta.shape != (p,) or C.shape != (p, p):
@@ -180,9 +179,14 @@ def pose(chain: Chain, estimate: Num[AnyArray, " p"], covariance: Num[AnyArray, 
             f"the estimate has the shape {theta.shape} and its covariance {C.shape}: for the {p} base parameters of "
             f"this chain they are ({p},) and ({p}, {p}), in the order of chain.names"
         )
+    return pose_in(cone_of(chain), np.asarray(chain.base.map, float), chain.names, theta, C)
+
+
+def pose_in(cone: Cone, B: Float[AnyArray, "p P"], names: Sequence[str], theta: Numbers, C: Numbers) -> Posed:
+    """The same for estimates `theta` (p,) of `B` times the standard parameters of any cone, with their `names`."""
     seen = np.isfinite(theta)
-    theta, L = theta[seen], _factor(C[np.ix_(seen, seen)], [n for n, k in zip(chain.names, seen, strict=True) if k])
-    B = np.asarray(chain.base.map, float)[seen]
+    theta, L = theta[seen], _factor(C[np.ix_(seen, seen)], [n for n, k in zip(names, seen, strict=True) if k])
+    B = np.asarray(B, float)[seen]
     # B scale = R' Q': the columns of Q beyond the first are what moves no base parameter.
     Q, R = np.linalg.qr((B @ cone.scale).T, mode="complete")
     k = len(theta)

@@ -147,7 +147,7 @@ def consistent_fit(
     Wensing and Park 2020 (distance).
     """
     posed = pose(chain, estimate, covariance)
-    y, distance = _nearest(_Program(posed, masses, MARGIN), weight)
+    y, distance = nearest_robot(posed, masses, MARGIN, weight)
     standard = posed.standard(y)
     standard[posed.cone.positive] = np.maximum(standard[posed.cone.positive], 0.0)
     base = np.asarray(chain.base.map, float) @ standard
@@ -189,7 +189,7 @@ def consistent_ranges(
     for name in names:
         if name not in known:
             raise ValueError(f"there is no standard parameter '{name}': {nearest(name, known)}")
-    _, distance = _nearest(_Program(posed, masses, MARGIN), WEAK)
+    _, distance = nearest_robot(posed, masses, MARGIN, WEAK)
     region = float(chdtri(posed.known, 1 - level)) if posed.known else 0.0
     farther = region if simultaneous else min(region, float(chdtri(1, 1 - level)))
     radius = float(np.sqrt(distance**2 + farther))
@@ -289,9 +289,10 @@ class _Search:
         return np.inf if abs(far) > GROWS * abs(near) else far
 
 
-def _nearest(program: _Program, weight: float) -> tuple[Numbers, float]:
+def nearest_robot(posed: Posed, masses: Masses | None, margin: float, weight: float) -> tuple[Numbers, float]:
     """(P,) the numbers of the nearest robot, and its distance from the estimate."""
-    cp, k = program.cp, program.posed.known
+    program = _Program(posed, masses, margin)
+    cp, k = program.cp, posed.known
     costs = [
         scale * cp.sum_squares(part) for scale, part in ((1.0, program.y[:k]), (weight, program.y[k:])) if part.size
     ]

@@ -1,6 +1,8 @@
 from .check import Finding as Finding
 from .check import Proposal as Proposal
 from .check import check_recording as check_recording
+from .drive_gains import DriveGains as DriveGains
+from .drive_gains import identify_gains as identify_gains
 from .estimates import Estimates as Estimates
 from .filter_settings import Filters as Filters
 from .filter_settings import FilterSettings as FilterSettings
@@ -8,6 +10,12 @@ from .filter_settings import design_filters as design_filters
 from .identify import at_other_lengths as at_other_lengths
 from .identify import estimate as estimate
 from .identify import in_windows as in_windows
+from .payload import KnownRobot as KnownRobot
+from .payload import Payload as Payload
+from .payload import identify_payload as identify_payload
+from .payload import identify_robot as identify_robot
+from .payload_window import PayloadWindow as PayloadWindow
+from .payload_window import WeighedNow as WeighedNow
 from .pipeline import Pipeline as Pipeline
 from .pipeline import WindowSettings as WindowSettings
 from .prepared import Prepared as Prepared

@@ -36,15 +36,22 @@ def sizes_of_joints(rows: Rows) -> Numbers:
     """(n,) root mean square of what the parameters of the whole recording leave of each torque; one where nothing is
     left."""
     W, torque, valid = (np.asarray(x) for x in (rows.W, rows.torque, rows.valid))
-    size = np.ones(torque.shape[1])
+    triangles, size = triangles_of(W, torque, valid), np.ones(torque.shape[1])
     for _ in range(ROUNDS):
-        theta = np.linalg.lstsq((W / size[:, None])[valid], (torque / size)[valid])[0]
-        left = np.where(valid, torque - W @ theta, 0)
-        before, size = size, np.sqrt((left**2).sum(axis=0) / np.maximum(valid.sum(axis=0), 1))
+        stacked = np.concatenate([R / s for R, s in zip(triangles, size, strict=True)])
+        theta = np.linalg.lstsq(stacked[:, :-1], stacked[:, -1])[0]
+        left = np.array([np.linalg.norm(R[:, -1] - R[:, :-1] @ theta) for R in triangles])
+        before, size = size, left / np.sqrt(np.maximum(valid.sum(axis=0), 1))
         size = np.where(size > 1e-9 * np.abs(torque).max(initial=0.0), size, 1.0)
         if np.abs(size / before - 1).max() < SETTLED:
             break
     return size
+
+
+def triangles_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> list[Numbers]:
+    """What least squares needs of each joint's rows: the triangle of its columns and torque, at most (p + 1, p + 1)."""
+    whole = np.concatenate([W, torque[..., None]], axis=-1)
+    return [np.asarray(np.linalg.qr(whole[valid[:, j], j])[1]) for j in range(torque.shape[1])]
 
 
 def by_size(rows: Rows, size: Numbers) -> Rows:
@@ -82,7 +89,7 @@ def covariance_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tupl
     y = np.where(valid, torque, 0).ravel()
     left = y - Q @ (Q.T @ y)
     error = left / np.sqrt(np.maximum(1 - (Q**2).sum(axis=1), LEAST_LEFT))
-    lags = _bandwidth(left.reshape(valid.shape), valid)
+    lags = common_lags(left.reshape(valid.shape), valid)
     scores = (Q * error[:, None]).reshape(*valid.shape, p).sum(axis=1)
     spread = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -94,7 +101,7 @@ def covariance_of(W: Numbers, torque: Numbers, valid: NDArray[np.bool_]) -> tupl
     return covariance, min(1.5 / share, float(valid.sum() - p))
 
 
-def _bandwidth(left: Numbers, valid: NDArray[np.bool_]) -> int:
+def common_lags(left: Numbers, valid: NDArray[np.bool_]) -> int:
     """Lags that count, by how much neighbouring residuals (S, n) have in common."""
     both = valid[1:] & valid[:-1]
     now, before = np.where(both, left[1:], 0), np.where(both, left[:-1], 0)

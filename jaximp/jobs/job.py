@@ -19,6 +19,7 @@ from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings, gap
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
 from jaximp.jobs.chain import ChainSettings
+from jaximp.jobs.payload import PayloadSettings, payload_settings
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import TrialsSettings, trials_settings
 from jaximp.models.base import Joints, Model
@@ -151,6 +152,8 @@ class WindowJob:
     """The recording of the robot alone, for the four methods."""
     robot_recording_after: Mapping[str, Any] | None = None
     """A second one, made after the recording with the human."""
+    payload: PayloadSettings | None = None
+    """What the recording with a load is to tell, beside `robot_recording` without it."""
     reference_period: float | None = None
     """Period of the reference trajectory [s]; the threshold for fake changes needs it and a reference position."""
     design: str | None = None
@@ -185,12 +188,21 @@ class WindowJob:
 
     def load_robot_alone(self) -> RobotAlone:
         """The recording of the robot alone, where the job has one; both of them where it has two."""
-        if self.robot_recording is None:
+        if self.robot_recording is None or self.payload is not None:
             return None
         before = recording_from_mapping(self.robot_recording, self.folder)
         if self.robot_recording_after is None:
             return before
         return before, recording_from_mapping(self.robot_recording_after, self.folder)
+
+    def load_pair(self) -> tuple[list[Recording], list[Recording]]:
+        """All recordings of a robot without a load, and all with it, each by itself."""
+        assert self.robot_recording is not None
+        several = [one for table in (self.recording, *self.more_recordings) for one in self._each(table)]
+        return self._each(self.robot_recording), several
+
+    def _each(self, table: Mapping[str, Any]) -> list[Recording]:
+        return list(recordings_from_mapping(table, self.folder))
 
     def load_design(self) -> FourierSeries | None:
         """The motion that was designed, where the job names one."""
@@ -309,7 +321,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     tables = tomllib.loads(text)
     recordings = ["recording", "robot_recording", "robot_recording_after"]
     known = [*recordings, "held_out", "model", "window", "filter", "trust", "reference_period", "design"]
-    check_keys(tables, [*known, "posterior", "trials"], "the job")
+    check_keys(tables, [*known, "payload", "posterior", "trials"], "the job")
     if "trials" in tables:
         return _job_of_trials(tables, folder, text)
     for required in ("recording", "model"):
@@ -330,6 +342,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
         held_out=_held_out(tables.get("held_out")),
         robot_recording=tables.get("robot_recording"),
         robot_recording_after=tables.get("robot_recording_after"),
+        payload=payload_settings(tables["payload"]) if "payload" in tables else None,
         model=model,
         window=_window(tables.get("window", {}), model),
         filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
@@ -461,8 +474,13 @@ def _check_values(job: WindowJob) -> None:
     both = job.model.human is not None and job.model.robot is not None
     if both and job.robot_recording is None:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
-    if not both and job.robot_recording is not None:
-        raise ValueError("[robot_recording] is of use only with both model.robot and model.human")
+    if job.payload is not None and (job.model.chain is None or job.robot_recording is None):
+        raise ValueError(
+            "a [payload] needs a robot with a urdf in [model.robot], and its recording without the load: add a "
+            "[robot_recording] table"
+        )
+    if not both and job.payload is None and job.robot_recording is not None:
+        raise ValueError("[robot_recording] is of use only with both model.robot and model.human, or with [payload]")
     if job.robot_recording_after is not None and job.robot_recording is None:
         raise ValueError("[robot_recording_after] is the second of two: add the first as [robot_recording]")
     if job.model.human is not None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from jaximp.identification.check import Finding, Proposal, check_recording
+from jaximp.identification.drive_gains import DriveGains
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
+from jaximp.identification.payload import Payload
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.prepared import prepare as prepare_recording
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
@@ -36,6 +38,17 @@ def identify_recording(
 ) -> list[Estimates]:
     """As `identify`, for recordings that are in memory; `alone` may be two, before and after the human's."""
     return estimate(job.pipeline_for(recording), recording, alone, progress, held_out)
+
+
+def weigh(job: WindowJob) -> Payload | DriveGains | None:
+    """What a job with `[payload]` asks for: the load, or by a known load the gains of the drives.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    if job.payload is None:
+        return None
+    alone, loaded = job.load_pair()
+    return job.payload.found(job.pipeline(loaded[0].joints, loaded[0].sample_rate), alone, loaded)
 
 
 def prepare(

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from factories.robots import joint, link, robot
+from jaximp.identification.payload import load_columns
 from jaximp.models import Chain
 from jaximp.recordings import recording_from_arrays
 from jaximp.types import Recording
@@ -67,6 +68,25 @@ def arrays(chain: Chain, seed: int, seconds: float = SECONDS, noise: float = 1.0
     coloured = lfilter([np.sqrt(1 - COLOUR**2)], [1, -COLOUR], white, axis=0)[200:]
     torque = np.asarray(chain.observation_matrix(q, dq, ddq)) @ truth_of(chain) + noise * SIZES * coloured
     return time, q + 1e-5 * rng.normal(size=q.shape), torque
+
+
+def with_load(
+    chain: Chain,
+    seed: int,
+    load: np.ndarray | None = None,
+    moves: int | None = None,
+    gain: float | np.ndarray = 1.0,
+    noise: float = 1.0,
+    **also: object,
+) -> Recording:
+    """The motion of one seed with the noise of another, and currents where there is a gain; `load` (10,) at the tip."""
+    _, q, dq, ddq = motion(seed if moves is None else moves)
+    time, position, torque = arrays(chain, seed, noise=noise)
+    noisy = torque - np.asarray(chain.observation_matrix(*motion(seed)[1:])) @ truth_of(chain)
+    theta = truth_of(chain) + (0 if load is None else load_columns(chain) @ load)
+    torque = np.asarray(chain.observation_matrix(q, dq, ddq)) @ theta + noisy
+    position = position - motion(seed)[1] + q
+    return recording_from_arrays(time, position, torque / gain, name=f"run {seed}", **also)  # type: ignore[arg-type]
 
 
 def recording(chain: Chain, seed: int, seconds: float = SECONDS, noise: float = 1.0) -> Recording:
