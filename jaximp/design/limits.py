@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.types import Numbers
 
 SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
@@ -31,6 +33,21 @@ class Limits:
 
 
 NO_LIMITS = Limits()
+
+
+def completed(limits: Limits, moved: Model) -> Limits:
+    """With what the URDF of a chain says of position, velocity and torque, where nothing else is given.
+
+    **Raises:** `ValueError` for motors that share joints, whose limits must be given.
+    """
+    if not isinstance(moved, Chain):
+        return limits
+    open_ = [name for name in ("position", "velocity", "torque") if getattr(limits, name) == getattr(NO_LIMITS, name)]
+    if not open_:
+        return limits
+    own = moved.recorded_limits
+    found: dict[str, Any] = {"position": (own.lower, own.upper), "velocity": own.velocity, "torque": own.effort}
+    return replace(limits, **{name: found[name] for name in open_})
 
 
 def room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:

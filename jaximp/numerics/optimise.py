@@ -1,21 +1,27 @@
 """One face for the optimisers: many starts at a time, minimised in one compiled call.
 
 optimistix is the rule. jaxopt, which is no longer maintained, adds two ways that it lacks; nothing else imports it.
-Which of them is the default for what was measured: experiments/benchmarks/excitation.py.
+scipy is driven from Python: it compiles the objective once, where the others have several copies of it in one program,
+which a robot's regressor makes minutes of. Which of them is the default for what was measured:
+experiments/benchmarks/excitation.py and chain_excitation.py.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import ModuleType
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
+
+from jaximp.numerics.cores import cores
 
 Objective = Callable[[Array], Array]
 Projection = Callable[[Array], Array]
@@ -25,6 +31,7 @@ METHODS = {
     "conjugate_gradient": "optimistix nonlinear conjugate gradient",
     "lbfgsb": "jaxopt bounded limited-memory BFGS",
     "projected_gradient": "jaxopt projected gradient; the projection solves a quadratic program",
+    "scipy": "scipy's BFGS, driven from Python",
 }
 
 
@@ -54,6 +61,8 @@ def minimise(
     """
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    if method == "scipy":
+        return descend_from_python(jax.jit(jax.value_and_grad(objective)), starts, max_steps, tolerance)
     if method in ("bfgs", "conjugate_gradient"):
         one = partial(_optimistix, objective, method, max_steps, tolerance)
     else:
@@ -71,6 +80,33 @@ def _optimistix(objective: Objective, method: str, max_steps: int, tolerance: fl
         lambda x, _: objective(x), solver, start, max_steps=max_steps, throw=False
     )
     return Found(solution.value, objective(solution.value), solution.stats["num_steps"])
+
+
+def descend_from_python(
+    value_and_slope: Callable[[Array], tuple[Array, Array]],
+    starts: Float[Array, "m d"],
+    max_steps: int = 500,
+    tolerance: float = 1e-9,
+) -> Found:
+    """scipy's BFGS from every start, on as many cores as there are; `value_and_slope` is compiled already.
+
+    It ends where all components of the slope are below the `tolerance`, or where no step gets lower.
+    """
+    from scipy.optimize import minimize
+
+    def descend(start: Array) -> tuple[Array, float, int]:
+        def both(x: Array) -> tuple[float, Array]:
+            value, slope = value_and_slope(x)
+            return float(value), np.asarray(slope)
+
+        found = minimize(
+            both, np.asarray(start), jac=True, method="BFGS", options={"maxiter": max_steps, "gtol": tolerance}
+        )
+        return found.x, float(found.fun), int(found.nit)
+
+    with ThreadPoolExecutor(cores()) as pool:
+        x, values, steps = zip(*pool.map(descend, np.asarray(starts)), strict=True)
+    return Found(jnp.asarray(np.array(x)), jnp.asarray(values), jnp.asarray(steps))
 
 
 def _jaxopt(
