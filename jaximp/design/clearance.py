@@ -203,13 +203,13 @@ def _distance_lanes(clearance: Clearance, q: Array) -> Array:
     moves = np.array(clearance.bodies) >= 0
     at = np.maximum(clearance.bodies, 0)
     world = jnp.einsum("ijkN,kej->keiN", turned[:, :, at], own) + origin[:, at].swapaxes(0, 1)[:, None]
-    ends = jnp.where(moves[:, None, None, None], world, own[..., None])  # (K, 2, 3, N)
-    radii = jnp.asarray(clearance.radii)
+    ends = jnp.where(moves[:, None, None, None], world, own[..., None]).transpose(1, 2, 0, 3)  # (2, 3, K, N)
+    radii = jnp.asarray(clearance.radii)[:, None]
     first, second = np.array(clearance.pairs, int).reshape(-1, 2).T
     above, plane = np.array(clearance.over, int).reshape(-1, 2).T
-    between = jax.vmap(segment_distance)(ends[first], ends[second]) - (radii[first] + radii[second])[:, None]
-    heights = jnp.einsum("kj,kejN->keN", jnp.asarray(clearance.normals)[plane], ends[above]).min(axis=1)
-    return jnp.concatenate([between, heights - (radii[above] + jnp.asarray(clearance.offsets)[plane])[:, None]])
+    between = segment_distance(ends[:, :, first], ends[:, :, second]) - radii[first] - radii[second]
+    heights = (jnp.asarray(clearance.normals).T[:, plane, None] * ends[:, :, above]).sum(axis=1).min(axis=0)
+    return jnp.concatenate([between, heights - radii[above] - jnp.asarray(clearance.offsets)[plane, None]])
 
 
 def _apart(chain: Chain, one: Capsule, other: Capsule) -> bool:
@@ -224,7 +224,7 @@ def _normals(planes: tuple[Plane, ...]) -> tuple[Numbers, Numbers]:
     offsets = np.array([plane.offset for plane in planes], float)
     length = np.linalg.norm(normals, axis=1)
     if not (np.isfinite(normals).all() and np.isfinite(offsets).all() and (length > 0).all()):
-        raise ValueError("a plane of clearance needs a finite normal that is not zero, and a finite offset [m]")
+        raise ValueError("a plane of clearance needs a normal that is not zero, and a finite offset [m]")
     return normals / length[:, None], offsets / length
 
 

@@ -48,7 +48,7 @@ def write_design(folder: Path, design: Design, sample_rate: float, joints: tuple
     (folder / "trajectory.json").write_text(text + "\n", encoding="utf-8")
     (folder / "trajectory.yaml").write_text(_ros(motion, joints), encoding="utf-8")
     if n == 6 and _rests(design):
-        (folder / "trajectory.script").write_text(urscript(design), encoding="utf-8")
+        (folder / "trajectory.script").write_text(urscript(design.trajectory), encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(_summary(design, sample_rate), indent=1) + "\n", encoding="utf-8")
 
 
@@ -69,11 +69,11 @@ def read_trajectory(path: str | Path) -> FourierSeries:
         raise ValueError(f"{path}: this is not a trajectory that jaximp designed; give its trajectory.json") from None
 
 
-def urscript(design: Design) -> str:
+def urscript(series: FourierSeries) -> str:
     """A program that moves to the first position, and then through one period; of six joints from rest to rest."""
-    count = math.ceil(design.period / CYCLE - 1e-9)
-    time = np.minimum(CYCLE * np.arange(count + 1), design.period)
-    rows = [f"[{', '.join(f'{number:.6f}' for number in row)}]" for row in np.asarray(design.trajectory(time)[0])]
+    count = math.ceil(float(series.period) / CYCLE - 1e-9)
+    time = np.minimum(CYCLE * np.arange(count + 1), float(series.period))
+    rows = [f"[{', '.join(f'{number:.6f}' for number in row)}]" for row in np.asarray(series(time)[0])]
     follow = f"t={CYCLE}, lookahead_time={LOOKAHEAD}, gain={GAIN}"
     lines = [
         "def excitation():",

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -101,9 +102,7 @@ def search(problem: Problem, starts: int, seed: int, progress: Progress) -> list
     work = _work(starts)
     for stage, share in zip(STAGES, work, strict=True):
         knobs = Knobs(*(jnp.asarray(number) for number in stage[:4]))
-        found = descend_from_python(
-            lambda x, knobs=knobs: _value_and_slope(problem, x, knobs), x, stage.steps, TOLERANCE
-        )
+        found = descend_from_python(partial(_value_and_slope, problem, knobs), x, stage.steps, TOLERANCE)
         order = np.argsort(np.asarray(found.value))
         count = max(FEWEST, math.ceil(stage.kept * len(order)))
         given_up += list(found.x[order[count:]])
@@ -168,7 +167,7 @@ def times_each(series: FourierSeries, factor: Array | float) -> FourierSeries:
 
 
 @eqx.filter_jit
-def _value_and_slope(problem: Problem, x: Array, knobs: Knobs) -> tuple[Array, Array]:
+def _value_and_slope(problem: Problem, knobs: Knobs, x: Array) -> tuple[Array, Array]:
     return jax.value_and_grad(_objective, argnums=1)(problem, x, knobs)
 
 

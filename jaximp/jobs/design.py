@@ -94,12 +94,11 @@ class ClearanceSettings:
             if len(numbers) != 4:
                 raise ValueError(f"clearance.walls.{name} is {numbers}: write four numbers, [x, y, z, offset]")
             planes.append(Plane((numbers[0], numbers[1], numbers[2]), numbers[3], name))
-        pairs = [tuple(pair) for pair in self.ignore or []]
-        if any(len(pair) != 2 for pair in pairs):
+        if any(len(pair) != 2 for pair in self.ignore or []):
             raise ValueError('clearance.ignore lists pairs of links, such as [["forearm", "base"]]')
         return Clearance.of(
             chain, urdf, distance=self.distance, radius=self.radius, radii=self.radii, planes=planes,
-            ignore=pairs, mean=mean,
+            ignore=[(one, other) for one, other in self.ignore or []], mean=mean,
         )  # fmt: skip
 
 

@@ -356,6 +356,8 @@ class Chain(Model):
         ddq: Num[ArrayLike, "..."],
     ) -> Float[Array, "..."]:
         """Torque [N m or N] that base parameters `theta` give: `regressor @ theta`, without its columns."""
+        if jnp.shape(theta) != (len(self.names),):
+            raise ValueError(f"theta has the shape {jnp.shape(theta)}: give {len(self.names)} base parameters")
         motion = self._checked(q, dq, ddq)
         if self.n_joints > 1:
             return rigid_body.over_samples(_own_torque_lanes, self.n_joints, (self, jnp.asarray(theta)), *motion)

@@ -22,6 +22,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from jaximp.numerics.cores import cores
+from jaximp.types import Numbers
 
 Objective = Callable[[Array], Array]
 Projection = Callable[[Array], Array]
@@ -94,14 +95,12 @@ def descend_from_python(
     """
     from scipy.optimize import minimize
 
-    def descend(start: Array) -> tuple[Array, float, int]:
-        def both(x: Array) -> tuple[float, Array]:
-            value, slope = value_and_slope(x)
+    def descend(start: Numbers) -> tuple[Numbers, float, int]:
+        def both(x: Numbers) -> tuple[float, Numbers]:
+            value, slope = value_and_slope(jnp.asarray(x))
             return float(value), np.asarray(slope)
 
-        found = minimize(
-            both, np.asarray(start), jac=True, method="BFGS", options={"maxiter": max_steps, "gtol": tolerance}
-        )
+        found = minimize(both, start, jac=True, method="BFGS", options={"maxiter": max_steps, "gtol": tolerance})
         return found.x, float(found.fun), int(found.nit)
 
     with ThreadPoolExecutor(cores()) as pool:
