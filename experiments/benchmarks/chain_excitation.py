@@ -1,8 +1,8 @@
 """Exciting motions of robots with six joints: the condition number reached, and in what time, compilation included.
 
 Limits: positions within half a turn, velocity and effort of the URDF, 4.9 rad/s^2; 10 s from rest to rest; 36 columns
-in SI units. Every seed is a process of its own, without a store of compiled programs: seconds count from the call to the
-motion. Motions are judged on 2000 instants, with pinocchio's torque where that is installed.
+in SI units. Every seed is a process of its own, without a store of compiled programs: seconds count from the call to
+the motion. Motions are judged on 2000 instants, with pinocchio's torque where that is installed.
 
 The robots are the UR10 of `example-robot-data`, where that is installed; the UR10e of the public recordings, where
 these are found (JAXIMP_DATA, else ../shared/data); and the arm that comes with the package. With `figaroh`
