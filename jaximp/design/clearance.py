@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -166,15 +166,13 @@ class Clearance(eqx.Module):
             raise ValueError(
                 "clearance has nothing to keep: no two links that are no neighbours move, and no plane is given"
             )
-        return eqx.tree_at(
-            lambda c: (c.pairs, c.over, c.names, c.notes), self,
-            (
-                tuple(pair for pair, keep in zip(self.pairs, kept[:count], strict=True) if keep),
-                tuple(pair for pair, keep in zip(self.over, kept[count:], strict=True) if keep),
-                tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
-                notes,
-            ),
-        )  # fmt: skip
+        return replace(
+            self,
+            pairs=tuple(pair for pair, keep in zip(self.pairs, kept[:count], strict=True) if keep),
+            over=tuple(pair for pair, keep in zip(self.over, kept[count:], strict=True) if keep),
+            names=tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
+            notes=notes,
+        )
 
 
 def segment_distance(a: Float[Array, "2 3 *N"], b: Float[Array, "2 3 *N"]) -> Float[Array, "*N"]:

@@ -211,7 +211,7 @@ def design_excitation(
     those parameters of the model that are not known yet; `columns.Load(robot)` is a load at its tip.
     `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
     error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them. By default
-    it is `bfgs`, and `scipy` for many columns and where a `clearance` is to be kept.
+    it is `bfgs`, and `python` for many columns and where a `clearance` is to be kept.
 
     A robot from a URDF (`models.Chain`) keeps the file's limits of position, velocity and torque where `limits` says
     nothing else, and its `parameters` are the file's.
@@ -231,12 +231,12 @@ def design_excitation(
     if isinstance(moved, Chain) and parameters is None:
         parameters = moved.parameters
     if method is None:
-        method = "bfgs" if clearance is None and len(model.names) < MANY else "scipy"
+        method = "bfgs" if clearance is None and len(model.names) < MANY else "python"
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
-    if method == "scipy" and encoder is not None:
-        raise ValueError("the method 'scipy' knows no encoder: leave one of them out")
-    if method != "scipy" and clearance is not None:
+    if method == "python" and encoder is not None:
+        raise ValueError("the method 'python' knows no encoder: leave one of them out")
+    if method != "python" and clearance is not None:
         raise ValueError(f"the method '{method}' keeps no clearance: leave out the method, or the clearance")
     limits = completed(limits, moved)
     problem = _problem(
@@ -244,7 +244,7 @@ def design_excitation(
         parameter=parameter, window=window, rest=rest, mean=mean, scale=scale, parameters=parameters,
         encoder=encoder, clearance=clearance, sample_rate=sample_rate,
     )  # fmt: skip
-    if method == "scipy":
+    if method == "python":
         found = search(problem, starts, seed, progress)
     else:
         x = descend(problem, random_starts(problem, starts, seed), method, progress)

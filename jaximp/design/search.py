@@ -1,7 +1,7 @@
 """The search for motions of robots: models with many columns, and limits that are no multiples of the motion.
 
 A robot's regressor takes seconds to compile, and an optimiser that is compiled with it holds many copies. Here it is
-compiled once with its gradient, once more to judge motions, and scipy's optimiser is driven from Python. Apart from
+compiled once with its gradient, once more to judge motions, and the optimiser is driven from Python. Apart from
 that the search differs from `motions.descend` in three ways:
 
 - **Each joint goes as far as its own limits allow**: a division again, by a norm of high power in place of the largest
@@ -16,10 +16,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +41,7 @@ from jaximp.design.motions import (
 )
 from jaximp.design.objectives import log_condition
 from jaximp.motion.trajectories import FourierSeries, jerk
+from jaximp.numerics.compilation import filter_compiled
 from jaximp.numerics.optimise import descend_from_python
 from jaximp.types import Numbers, Progress
 
@@ -91,8 +91,10 @@ class Seen(NamedTuple):
     """Condition number of the worst window."""
     unit: Array
     """Condition number over the period of columns of unit norm."""
+    most: Array
+    """The largest share by which torque and clearance exceed their limits."""
     excess: Array
-    """(N, n + C) by how much torque and clearance exceed their limits, as shares of them."""
+    """(N, n + C) the same at each instant."""
 
 
 def search(problem: Problem, starts: int, seed: int, progress: Progress) -> list[Motion]:
@@ -102,7 +104,8 @@ def search(problem: Problem, starts: int, seed: int, progress: Progress) -> list
     work = _work(starts)
     for stage, share in zip(STAGES, work, strict=True):
         knobs = Knobs(*(jnp.asarray(number) for number in stage[:4]))
-        found = descend_from_python(partial(_value_and_slope, problem, knobs), x, stage.steps, TOLERANCE)
+        value_and_slope = partial(filter_compiled(_value_and_slope), problem, knobs)
+        found = descend_from_python(value_and_slope, x, stage.steps, TOLERANCE)
         order = np.argsort(np.asarray(found.value))
         count = max(FEWEST, math.ceil(stage.kept * len(order)))
         given_up += list(found.x[order[count:]])
@@ -125,22 +128,28 @@ def finished(problem: Problem, x: Array) -> Motion:
     """The motion on the fine grid, within all limits; its objective is infinite where there is none."""
     t = problem.instants(FINER)
     series = direction_of(problem, x)
-    most = shares_reached(problem, series, t).max(axis=0)
-    series = times_each(series, 1 / jnp.maximum(most * (1 + ROUNDING), 1.0))
+    series = times_each(series, 1 / jnp.maximum(_reached(problem, x[None], FINER)[0] * (1 + ROUNDING), 1.0))
 
+    @cache
     def seen(factor: float) -> Seen:
-        return _seen(problem, *times_each(series, factor)(t))
+        return filter_compiled(_seen)(problem, *times_each(series, factor)(t))
 
-    def excess(factor: float) -> float:
-        return float(jnp.max(seen(factor).excess, initial=-jnp.inf))
-
-    factor = 1.0 if excess(1.0) <= 0 else _factor(excess)
+    factor = 1.0 if seen(1.0).most <= 0 else _factor(lambda factor: float(seen(factor).most))
     if factor is None:
         return Motion(as_given(problem, series), *[math.inf] * 4)
     value, *conditions = (float(number) for number in seen(factor)[:4])
     return Motion(
         as_given(problem, times_each(series, factor)), value if math.isfinite(value) else math.inf, *conditions
     )
+
+
+def _reached(problem: Problem, x: Array, finer: int = 1) -> Array:
+    """(m, n) how far the motion of each joint goes, as a share of the limit that it comes closest to."""
+    return filter_compiled(_reached_by_all)(problem, x, problem.instants(finer))
+
+
+def _reached_by_all(problem: Problem, x: Array, t: Array) -> Array:
+    return jax.vmap(lambda x: shares_reached(problem, direction_of(problem, x), t).max(axis=0))(x)
 
 
 def _factor(excess: Callable[[float], float]) -> float | None:
@@ -166,7 +175,6 @@ def times_each(series: FourierSeries, factor: Array | float) -> FourierSeries:
     return FourierSeries(series.sine * factor, series.cosine * factor, series.offset, series.period)
 
 
-@eqx.filter_jit
 def _value_and_slope(problem: Problem, knobs: Knobs, x: Array) -> tuple[Array, Array]:
     return jax.value_and_grad(_objective, argnums=1)(problem, x, knobs)
 
@@ -214,7 +222,6 @@ def _excess(problem: Problem, motion: tuple[Array, ...], rows: Array, smooth: Ar
     return jnp.concatenate(parts, axis=1)
 
 
-@eqx.filter_jit
 def _seen(problem: Problem, q: Array, dq: Array, ddq: Array) -> Seen:
     motion = (q, dq, ddq)
     rows = regressor_rows(problem.model, motion, None, problem.period)
@@ -224,7 +231,9 @@ def _seen(problem: Problem, q: Array, dq: Array, ddq: Array) -> Seen:
     unit = log_condition(grams_of(replace(plain, unit=True), rows, whole=True))[0]
     value = worth_of_grams(problem, grams_of(problem, rows), None)
     excess = _excess(problem, motion, rows, None)
-    return Seen(value, jnp.exp(log_condition(whole))[0], jnp.exp(windows), jnp.exp(unit), excess)
+    return Seen(
+        value, jnp.exp(log_condition(whole))[0], jnp.exp(windows), jnp.exp(unit), excess.max(initial=-1.0), excess
+    )
 
 
 def _random_starts(problem: Problem, count: int, seed: int) -> Array:
@@ -234,11 +243,9 @@ def _random_starts(problem: Problem, count: int, seed: int) -> Array:
     coefficients = random.normal(size=(count, 2, n, h)) * spectrum
     rests = _rests(problem, count, random)
     x = np.concatenate([rests, coefficients.reshape(count, -1)], axis=1)
-    t = problem.instants()
-    for one in x:
-        reached = np.asarray(shares_reached(problem, direction_of(problem, jnp.asarray(one)), t)).max(axis=0)
-        size = np.where(reached > 0, random.uniform(0.5, 1.5, n) / np.where(reached > 0, reached, 1), 1.0)
-        one[n:] = (one[n:].reshape(2, n, h) * size[:, None]).ravel()
+    reached = np.asarray(_reached(problem, jnp.asarray(x)))
+    size = np.where(reached > 0, random.uniform(0.5, 1.5, (count, n)) / np.where(reached > 0, reached, 1), 1.0)
+    x[:, n:] = (x[:, n:].reshape(count, 2, n, h) * size[:, None, :, None]).reshape(count, -1)
     return jnp.asarray(x)
 
 
@@ -251,7 +258,7 @@ def _rests(problem: Problem, count: int, random: np.random.Generator) -> Numbers
     offsets = jax.vmap(lambda own: direction_of(problem, jnp.concatenate([own, jnp.asarray(zero)])).offset)(
         jnp.asarray(x)
     )
-    excess = np.asarray(_seen(problem, offsets, still, still).excess)
+    excess = np.asarray(filter_compiled(_seen)(problem, offsets, still, still).excess)
     fits = (excess < 0).all(axis=1)
     if not fits.any():
         raise ValueError(_nowhere(problem, excess))

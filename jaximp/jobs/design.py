@@ -53,7 +53,7 @@ class DesignSettings:
     seed: int = 0
     """Seed of the random motions."""
     method: str | None = None
-    """The optimiser: `bfgs`, `conjugate_gradient`, `lbfgsb`, `projected_gradient` or `scipy`; by default `scipy` for
+    """The optimiser: `bfgs`, `conjugate_gradient`, `lbfgsb`, `projected_gradient` or `python`; by default `python` for
     many parameters and where a clearance is kept, else `bfgs`."""
 
 

@@ -104,7 +104,7 @@ def with_shape(shape: str, kind: str = "collision") -> str:
     place = '<origin xyz="0.01 0.02 0.1" rpy="0.3 0.2 -0.4"/>'
     element = f"<{kind}>{place}<geometry>{shape}</geometry></{kind}>"
     return robot(
-        link("ground"), joint("a", "ground", "one"), link("one"), joint("b", "one", "two", axis="0 1 0"),
+        link("ground"), joint("a", "ground", "one", axis="0 1 0"), link("one"), joint("b", "one", "two", axis="0 1 0"),
         link("two").replace("</link>", f"{element}</link>"),
     )  # fmt: skip
 
