@@ -19,7 +19,7 @@ from jaxtyping import Array
 from jaximp.design.bounds import condition_bound
 from jaximp.design.clearance import Clearance
 from jaximp.design.columns import Selected
-from jaximp.design.limits import NO_LIMITS, SYMMETRIC, Limits, completed, per_joint, room
+from jaximp.design.limits import NO_LIMITS, SYMMETRIC, Limits, completed, per_joint, room, unlimited
 from jaximp.design.motions import (
     FINER,
     PER_CYCLE,
@@ -111,7 +111,7 @@ class Design:
         if not self.worst_condition < COLLINEAR:
             lines.append("not all parameters can be told apart: use another objective, or a smaller model")
         lines.append(f"limits reached: {self.limits_reached()}")
-        if self.objective == "condition" and not self.active and self.limits != Limits():
+        if self.objective == "condition" and not self.active and len(unlimited(self.limits)) < 5:
             lines.append(
                 "a larger motion would keep the limits: the condition number does not ask for size, stderr does"
             )
@@ -194,7 +194,7 @@ def design_excitation(
     columns: Sequence[str] | None = None,
     clearance: Clearance | None = None,
     sample_rate: float = 1000.0,
-    starts: int = 32,
+    starts: int | None = None,
     seed: int = 0,
     method: str | None = None,
     progress: Progress = lambda share: None,
@@ -211,7 +211,7 @@ def design_excitation(
     those parameters of the model that are not known yet; `columns.Load(robot)` is a load at its tip.
     `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
     error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them. By default
-    it is `bfgs`, and `python` for many columns and where a `clearance` is to be kept.
+    the method is `bfgs` from 32 starts, and `python` from 16 for many columns and where a `clearance` is to be kept.
 
     A robot from a URDF (`models.Chain`) keeps the file's limits of position, velocity and torque where `limits` says
     nothing else, and its `parameters` are the file's.
@@ -245,9 +245,10 @@ def design_excitation(
         encoder=encoder, clearance=clearance, sample_rate=sample_rate,
     )  # fmt: skip
     if method == "python":
-        found = search(problem, starts, seed, progress)
+        found = search(problem, 16 if starts is None else starts, seed, progress)
     else:
-        x = descend(problem, random_starts(problem, starts, seed), method, progress)
+        x = random_starts(problem, 32 if starts is None else starts, seed)
+        x = descend(problem, x, method, progress)
         found = [judged(problem, one) for one in x]
     values = np.array([one.value for one in found])
     conditions = np.sort([one.worst for one in found])

@@ -35,19 +35,23 @@ class Limits:
 NO_LIMITS = Limits()
 
 
+def unlimited(limits: Limits) -> tuple[str, ...]:
+    """Names of what has no limit at all."""
+    ends = {"position": limits.position} | {name: (getattr(limits, name),) for name in SYMMETRIC}
+    return tuple(name for name, values in ends.items() if all(np.isinf(value).all() for value in values))
+
+
 def completed(limits: Limits, moved: Model) -> Limits:
     """With what the URDF of a chain says of position, velocity and torque, where nothing else is given.
 
     **Raises:** `ValueError` for motors that share joints, whose limits must be given.
     """
-    if not isinstance(moved, Chain):
+    missing = {"position", "velocity", "torque"} & set(unlimited(limits))
+    if not isinstance(moved, Chain) or not missing:
         return limits
-    open_ = [name for name in ("position", "velocity", "torque") if getattr(limits, name) == getattr(NO_LIMITS, name)]
-    if not open_:
-        return limits
-    own = moved.recorded_limits
-    found: dict[str, Any] = {"position": (own.lower, own.upper), "velocity": own.velocity, "torque": own.effort}
-    return replace(limits, **{name: found[name] for name in open_})
+    low, high, velocity, effort = (tuple(values.tolist()) for values in moved.recorded_limits)
+    found: dict[str, Any] = {"position": (low, high), "velocity": velocity, "torque": effort}
+    return replace(limits, **{name: found[name] for name in missing})
 
 
 def room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:

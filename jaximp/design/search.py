@@ -63,9 +63,9 @@ class Stage(NamedTuple):
 
 
 STAGES = (
-    Stage(0.1, 10.0, 20.0, 1.0, 40, 0.25),
-    Stage(0.03, 40.0, 60.0, 10.0, 150, 0.5),
-    Stage(0.01, 200.0, 300.0, 100.0, 400, 1.0),
+    Stage(0.1, 4.0, 10.0, 1.0, 60, 0.2),
+    Stage(0.03, 20.0, 40.0, 30.0, 200, 0.5),
+    Stage(0.01, 200.0, 300.0, 1000.0, 400, 1.0),
 )
 FEWEST = 2
 """So many starts go on at least."""
@@ -238,6 +238,8 @@ def _seen(problem: Problem, q: Array, dq: Array, ddq: Array) -> Seen:
 
 def _random_starts(problem: Problem, count: int, seed: int) -> Array:
     """Motions of all shapes, each joint near its limits, about mean positions that keep torque and clearance."""
+    if count < 1:
+        raise ValueError(f"starts is {count}: give at least one")
     random, (n, h) = np.random.default_rng(seed), (problem.n, problem.harmonics)
     spectrum = np.arange(1, h + 1) ** random.uniform(-1, 1, (count, 1, n, 1))
     coefficients = random.normal(size=(count, 2, n, h)) * spectrum

@@ -48,8 +48,8 @@ class DesignSettings:
     of a load at its tip, or a list of those parameters that are not known."""
     joints: int = 1
     """How many joints of this model stand side by side."""
-    starts: int = 32
-    """How many random motions the optimiser starts from."""
+    starts: int | None = None
+    """How many random motions the optimiser starts from; by default 32, and 16 by the method `python`."""
     seed: int = 0
     """Seed of the random motions."""
     method: str | None = None

@@ -57,7 +57,7 @@ def require_numbers(name: str, instead: str, *trees: Any) -> None:
 def filter_compiled(function: Callable[P, R]) -> Callable[P, R]:
     """`equinox.filter_jit` of a function, made when it is first asked for, with what makes it compile fast."""
     fast = {name: value for name, value in options().items() if name == FAST}
-    return eqx.filter_jit(function, compiler_options=fast)
+    return eqx.filter_jit(function, compiler_options=fast)  # type: ignore[call-overload]
 
 
 def compiled(function: Callable[P, R], **settings: Any) -> Callable[P, R]:
