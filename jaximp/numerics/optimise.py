@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import ModuleType
 from typing import NamedTuple
@@ -21,7 +20,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaximp.numerics.cores import cores
 from jaximp.types import Numbers
 
 Objective = Callable[[Array], Array]
@@ -96,17 +94,17 @@ def descend_from_python(
     max_steps: int = 500,
     tolerance: float = 1e-9,
 ) -> Found:
-    """BFGS from every start, on as many cores as there are; `value_and_slope` is compiled already.
+    """BFGS from one start after the other; `value_and_slope` is compiled already.
 
-    It ends where a step lowers the value by less than the `tolerance`, or where none does.
+    It ends where a step lowers the value by less than the `tolerance`, or where none does. Starts do not run side by
+    side: two compiled programs that decompose batches of matrices can wait for each other for ever.
     """
 
     def both(x: Numbers) -> tuple[float, Numbers]:
         value, slope = value_and_slope(jnp.asarray(x))
         return float(value), np.asarray(slope)
 
-    with ThreadPoolExecutor(cores()) as pool:
-        found = list(pool.map(lambda start: _bfgs(both, start, max_steps, tolerance), np.asarray(starts)))
+    found = [_bfgs(both, start, max_steps, tolerance) for start in np.asarray(starts)]
     x, values, steps = zip(*found, strict=True)
     return Found(jnp.asarray(np.array(x)), jnp.asarray(values), jnp.asarray(steps))
 
