@@ -23,7 +23,7 @@ from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.chain import ChainSettings
-from jaximp.jobs.design import DesignSettings, EncoderSettings
+from jaximp.jobs.design import ClearanceSettings, DesignSettings, EncoderSettings
 from jaximp.jobs.job import HumanSettings, ModelSettings, ReflexSettings, RobotSettings, WindowJob
 from jaximp.jobs.payload import PayloadSettings
 from jaximp.jobs.trials import STATIC_WINDOW, HandleSettings, TrialsSettings, TriggerSettings
@@ -122,6 +122,7 @@ DESIGN_JOB = (
         Limits,
         "What the motion keeps at every instant: one number for all joints, or a list with one for each.",
     ),
+    Table("[clearance]", ClearanceSettings, "What a robot with a URDF stays away from: its own links, and planes."),
     Table("[encoder]", EncoderSettings, "How the motion will be measured, if its quantisation is to be in the loop."),
 )
 KINDS = {
@@ -132,6 +133,8 @@ KINDS = {
     list[float]: "list of numbers",
     dict[str, float]: "table of numbers",
     list[str]: "list of text",
+    list[list[str]]: "list of lists of text",
+    dict[str, list[float]]: "table of lists of numbers",
     list[list[float]]: "list of lists of numbers",
     Mapping[str, Any]: "table",
     tuple[str, ...]: "list of names",
@@ -226,7 +229,10 @@ def page() -> str:
         *(line for table in TRIALS_JOB for line in section(table)),
         "## A job of a design\n",
         "`[model]` is that of a job with a recording. `[parameters]` and `[scale]` give a number for each parameter, "
-        "by its name: the parameters that limits of the torque need, and the sizes by which columns are compared.\n",
+        "by its name: the parameters that limits of the torque need, and the sizes by which columns are compared; "
+        '`scale = "unit"` at the head of the job compares them at unit norm. A robot with a URDF (`[model.robot]` with '
+        "`urdf`) keeps the file's limits of position, velocity and torque, and has its parameters, where the job gives "
+        "no others.\n",
         *(line for table in DESIGN_JOB for line in section(table)),
     ]
     return "\n".join(parts).rstrip() + "\n"

@@ -1,7 +1,12 @@
 from .bounds import condition_bound as condition_bound
+from .clearance import Clearance as Clearance
+from .clearance import Plane as Plane
+from .columns import Load as Load
+from .columns import Selected as Selected
 from .excitation import Design as Design
 from .excitation import design_excitation as design_excitation
 from .files import read_trajectory as read_trajectory
+from .files import urscript as urscript
 from .files import write_design as write_design
 from .limits import Limits as Limits
 from .motions import Encoder as Encoder

@@ -8,6 +8,7 @@ is exact, and all starts descend at once (`motions.py`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jaximp.design.bounds import condition_bound
-from jaximp.design.limits import NO_LIMITS, SYMMETRIC, Limits, per_joint, room
+from jaximp.design.clearance import Clearance
+from jaximp.design.columns import Selected
+from jaximp.design.limits import NO_LIMITS, SYMMETRIC, Limits, completed, per_joint, room, unlimited
 from jaximp.design.motions import (
     FINER,
     PER_CYCLE,
@@ -29,11 +32,14 @@ from jaximp.design.motions import (
     sliding_sums,
     torque_share,
 )
+from jaximp.design.objectives import MANY
+from jaximp.design.search import search
 from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.numerics.optimise import METHODS
 from jaximp.numerics.precision import require_float64
-from jaximp.types import Numbers, Progress, nearest
+from jaximp.types import Numbers, Progress, listed, nearest
 
 OBJECTIVES = {
     "condition": "condition number of the regressor",
@@ -78,13 +84,19 @@ class Design:
     window: float | None = None
     """Length of the windows that were designed for [s]."""
     moved: Model | None = None
-    """The model of everything that is moved, where that is more than what is identified."""
+    """The model of everything that is moved, which may be more than what is identified."""
     parameter: str | None = None
     """The parameter whose standard error was made small."""
+    unit_condition: float | None = None
+    """Condition number over the period of columns of unit norm, where it was computed."""
+    clearance: Clearance | None = None
+    """What the motion keeps its distance from."""
 
     def in_words(self) -> list[str]:
         """The result in words, one line for each fact."""
         lines = [f"condition number over a period of {self.period:g} s: {self.condition:.4g}"]
+        if self.unit_condition is not None:
+            lines[0] += f" of columns in SI units, {self.unit_condition:.4g} of columns of unit norm"
         if self.objective != "condition":
             lines.insert(0, self._objective_in_words())
         if math.isnan(self.lower_bound):
@@ -98,12 +110,24 @@ class Design:
             lines.append(f"condition number in the worst window of {self.window:.4g} s: {self.worst_condition:.4g}")
         if not self.worst_condition < COLLINEAR:
             lines.append("not all parameters can be told apart: use another objective, or a smaller model")
-        lines.append("limits reached: " + (", ".join(self.active) or "none"))
-        if self.objective == "condition" and not self.active and self.limits != Limits():
+        lines.append(f"limits reached: {self.limits_reached()}")
+        if self.objective == "condition" and not self.active and len(unlimited(self.limits)) < 5:
             lines.append(
                 "a larger motion would keep the limits: the condition number does not ask for size, stderr does"
             )
-        return lines
+        return lines + ([] if self.clearance is None else list(self.clearance.notes))
+
+    def limits_reached(self) -> str:
+        """In words, joints that reach the same limit together: `velocity of joints 1, 2 and 5`."""
+        joints: dict[str, list[str]] = {}
+        for text in self.active:
+            what, _, joint = text.rpartition(" of joint ")
+            joints.setdefault(what or text, []).extend([joint] if what else [])
+        several = {what: "s" if len(of) > 1 else "" for what, of in joints.items()}
+        return (
+            ", ".join(what + (f" of joint{several[what]} {listed(of)}" if of else "") for what, of in joints.items())
+            or "none"
+        )
 
     def _objective_in_words(self) -> str:
         where = f"over a period of {self.period:g} s" if self.window is None else f"in windows of {self.window:.4g} s"
@@ -167,10 +191,12 @@ def design_excitation(
     parameters: Any = None,
     moved: Model | None = None,
     encoder: Encoder | None = None,
+    columns: Sequence[str] | None = None,
+    clearance: Clearance | None = None,
     sample_rate: float = 1000.0,
-    starts: int = 32,
+    starts: int | None = None,
     seed: int = 0,
-    method: str = "bfgs",
+    method: str | None = None,
     progress: Progress = lambda share: None,
 ) -> Design:
     """Design a periodic motion, a finite Fourier series, that excites every parameter of a model.
@@ -179,11 +205,16 @@ def design_excitation(
     (`stderr` is that of `parameter`, by its name), over the whole period, or over the worst of all sliding windows of
     `window` seconds. `rest` makes the period begin and end at rest. `mean` position [rad or m], for all joints or for
     each; where it is not given, it is designed as well. `scale` (p,) the size of each parameter: columns are compared
-    by the torque that they make. `parameters` (p,) of the model, which a limit of the torque needs. Where more is moved
-    than is to be identified, such as a known robot with the human in it, `moved` is the model of it all, and the
-    `parameters` and the limit of the torque are its.
+    by the torque that they make; with `"unit"` they are compared at unit norm. `parameters` (p,) of the model, which a
+    limit of the torque needs. Where more is moved than is to be identified, such as a known robot with the human in it,
+    `moved` is the model of it all, and the `parameters` and the limit of the torque are its. `columns` are the names of
+    those parameters of the model that are not known yet; `columns.Load(robot)` is a load at its tip.
     `encoder` brings the quantised position into the objective. `sample_rate` [Hz] of the measurements that a standard
-    error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them.
+    error counts. `starts` random motions are improved by `method` (`optimise.METHODS`); `seed` draws them. By default
+    the method is `bfgs` from 32 starts, and `python` from 16 for many columns and where a `clearance` is to be kept.
+
+    A robot from a URDF (`models.Chain`) keeps the file's limits of position, velocity and torque where `limits` says
+    nothing else, and its `parameters` are the file's.
 
     **Returns:** a `Design`: the best motion. It keeps the limits on a grid of at least 240 instants in every period of
     the highest harmonic.
@@ -193,29 +224,45 @@ def design_excitation(
     **Source:** Tout et al. 2023, III-A; the series of Swevers et al. 1997.
     """
     require_float64()
+    if moved is None:
+        moved = model
+    if columns is not None:
+        model = Selected(model, columns)
+    if isinstance(moved, Chain) and parameters is None:
+        parameters = moved.parameters
+    if method is None:
+        method = "bfgs" if clearance is None and len(model.names) < MANY else "python"
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    if method == "python" and encoder is not None:
+        raise ValueError("the method 'python' knows no encoder: leave one of them out")
+    if method != "python" and clearance is not None:
+        raise ValueError(f"the method '{method}' keeps no clearance: leave out the method, or the clearance")
+    limits = completed(limits, moved)
     problem = _problem(
-        model, moved or model, harmonics=harmonics, period=period, limits=limits, objective=objective,
+        model, moved, harmonics=harmonics, period=period, limits=limits, objective=objective,
         parameter=parameter, window=window, rest=rest, mean=mean, scale=scale, parameters=parameters,
-        encoder=encoder, sample_rate=sample_rate,
+        encoder=encoder, clearance=clearance, sample_rate=sample_rate,
     )  # fmt: skip
-    x = random_starts(problem, starts, seed)
-    x = descend(problem, x, method, progress)
-    found = [judged(problem, one) for one in x]
-    values = np.array([value for _, value, _, _ in found])
-    conditions = np.sort([worst for *_, worst in found])
-    series, value, condition, worst = found[int(np.nanargmin(values))]
-    if not math.isfinite(value):
+    if method == "python":
+        found = search(problem, 16 if starts is None else starts, seed, progress)
+    else:
+        x = random_starts(problem, 32 if starts is None else starts, seed)
+        x = descend(problem, x, method, progress)
+        found = [judged(problem, one) for one in x]
+    values = np.array([one.value for one in found])
+    conditions = np.sort([one.worst for one in found])
+    best = found[int(np.nanargmin(values))]
+    if not math.isfinite(best.value):
         raise ValueError(
             "no motion of so few harmonics tells all parameters apart: give more harmonics, wider limits, or a smaller "
             "model"
         )
     bound, source = condition_bound(model, harmonics, period)
     return Design(
-        series, model, condition, worst, bound, source, period, objective, _in_units(problem, value), limits,
-        _active(problem, series), conditions, None if parameters is None else np.asarray(parameters, float), window,
-        moved, parameter,
+        best.series, model, best.condition, best.worst, bound, source, period, objective,
+        _in_units(problem, best.value), limits, _active(problem, best.series), conditions,
+        None if parameters is None else np.asarray(parameters, float), window, moved, parameter, best.unit, clearance,
     )  # fmt: skip
 
 
@@ -234,6 +281,7 @@ def _problem(
     scale: Any = None,
     parameters: Any = None,
     encoder: Encoder | None = None,
+    clearance: Clearance | None = None,
     sample_rate: float = 1000.0,
 ) -> Problem:
     """The settings, checked."""
@@ -254,7 +302,10 @@ def _problem(
             f"limits.torque needs the parameters of the model, here {', '.join(moved.names)}: pass parameters=..., or "
             "write a [parameters] table"
         )
-    scale = jnp.ones(len(model.names)) if scale is None else _per_parameter("scale", scale, model)
+    unit = isinstance(scale, str)
+    if unit and scale != "unit":
+        raise ValueError(f"scale is '{scale}': write 'unit' for columns of unit norm, or give a size of each parameter")
+    scale = jnp.ones(len(model.names)) if scale is None or unit else _per_parameter("scale", scale, model)
     if not (scale > 0).all():
         raise ValueError("scale must be above zero: it is the size of each parameter")
     return Problem(
@@ -274,6 +325,9 @@ def _problem(
         window=None if window is None else window / period,
         encoder=encoder,
         samples=period * (sample_rate if encoder is None else encoder.sample_rate),
+        unit=unit,
+        whole=model is moved,
+        clearance=clearance,
     )
 
 
@@ -327,6 +381,11 @@ def _active(problem: Problem, series: FourierSeries) -> tuple[str, ...]:
     if problem.parameters is not None:
         reached.append(np.asarray(torque_share(problem, several, t, None)))
     of = [f" of joint {j + 1}" if n > 1 else "" for j in range(n)]
-    return tuple(
+    active = [
         name + of[j] for name, shares in zip(names, reached, strict=False) for j in range(n) if shares[j] >= ACTIVE
-    )
+    ]
+    if problem.clearance is not None:
+        shares = np.asarray(problem.clearance.shares(several(t)[0])).max(axis=0)
+        close = [name for name, share in zip(problem.clearance.names, shares, strict=True) if share >= ACTIVE]
+        active += [f"clearance of {name}" for name in dict.fromkeys(close)]
+    return tuple(active)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.types import Numbers
 
 SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
@@ -31,6 +33,25 @@ class Limits:
 
 
 NO_LIMITS = Limits()
+
+
+def unlimited(limits: Limits) -> tuple[str, ...]:
+    """Names of what has no limit at all."""
+    ends = {"position": limits.position} | {name: (getattr(limits, name),) for name in SYMMETRIC}
+    return tuple(name for name, values in ends.items() if all(np.isinf(value).all() for value in values))
+
+
+def completed(limits: Limits, moved: Model) -> Limits:
+    """With what the URDF of a chain says of position, velocity and torque, where nothing else is given.
+
+    **Raises:** `ValueError` for motors that share joints, whose limits must be given.
+    """
+    missing = {"position", "velocity", "torque"} & set(unlimited(limits))
+    if not isinstance(moved, Chain) or not missing:
+        return limits
+    low, high, velocity, effort = (tuple(values.tolist()) for values in moved.recorded_limits)
+    found: dict[str, Any] = {"position": (low, high), "velocity": velocity, "torque": effort}
+    return replace(limits, **{name: found[name] for name in missing})
 
 
 def room(limits: Limits, n: int) -> tuple[Numbers, Numbers, Numbers]:

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaximp.design.clearance import Clearance
 from jaximp.design.objectives import log_condition, log_sigma_min, log_stderr, log_volume
 from jaximp.models.base import Model
 from jaximp.motion.trajectories import FourierSeries, at_rest, jerk
@@ -87,6 +89,11 @@ class Problem(eqx.Module):
     encoder: Encoder | None = eqx.field(static=True)
     samples: float = eqx.field(static=True)
     """How many measurements one period has."""
+    unit: bool = eqx.field(static=True, default=False)
+    """Columns are compared at unit norm."""
+    whole: bool = eqx.field(static=True, default=True)
+    """What is moved is what is identified, and nothing else."""
+    clearance: Clearance | None = None
 
     @property
     def n(self) -> int:
@@ -98,7 +105,7 @@ class Problem(eqx.Module):
         return jnp.arange(count) * (self.period / count)
 
 
-def _direction(problem: Problem, x: Array) -> FourierSeries:
+def direction_of(problem: Problem, x: Array) -> FourierSeries:
     """Move the offsets inside their limits; leave the coefficients as they are."""
     n, h = problem.n, problem.harmonics
     offset = problem.mean
@@ -112,14 +119,14 @@ def _direction(problem: Problem, x: Array) -> FourierSeries:
     return at_rest(series) if problem.rest else series
 
 
-def _times(series: FourierSeries, factor: Array | float) -> FourierSeries:
+def times(series: FourierSeries, factor: Array | float) -> FourierSeries:
     return FourierSeries(series.sine * factor, series.cosine * factor, series.offset, series.period)
 
 
 def feasible_motion(problem: Problem, x: Array, t: Array, smooth: Array | None) -> tuple[FourierSeries, Array]:
     """As far from rest as the limits allow, and how much rest itself exceeds the limit of the torque."""
-    series = _direction(problem, x)
-    series = _times(series, 1 / jnp.maximum(shares_reached(problem, series, t).max(), 1.0))
+    series = direction_of(problem, x)
+    series = times(series, 1 / jnp.maximum(shares_reached(problem, series, t).max(), 1.0))
     if problem.parameters is None:
         return series, jnp.zeros(())
     return _within_torque(problem, series, t, smooth)
@@ -141,16 +148,16 @@ def _within_torque(
     """The largest part of a motion whose torque keeps its limit: a root, differentiated as an implicit function."""
 
     def excess(factor: Array, series: FourierSeries) -> Array:
-        return torque_share(problem, _times(series, factor), t, smooth).max() - 1
+        return torque_share(problem, times(series, factor), t, smooth).max() - 1
 
     fixed = jax.lax.stop_gradient(series)
-    at_rest = torque_share(problem, _times(series, 0.0), t[:1], smooth).max() - 1
+    at_rest = torque_share(problem, times(series, 0.0), t[:1], smooth).max() - 1
     at_most = excess(jnp.ones(()), fixed)
     root = _root(lambda factor: excess(factor, fixed), jax.lax.stop_gradient(at_rest), at_most)
     slope = jax.lax.stop_gradient(jax.jvp(lambda factor: excess(factor, fixed), (root,), (jnp.ones(()),))[1])
     step = excess(root, series) / jnp.where(slope == 0, 1, slope)
     factor = jnp.where(at_most <= 0, 1.0, root - (step - jax.lax.stop_gradient(step)))
-    return _times(series, factor), jnp.maximum(at_rest, 0)
+    return times(series, factor), jnp.maximum(at_rest, 0)
 
 
 def _root(excess: Callable[[Array], Array], at_zero: Array, at_one: Array) -> Array:
@@ -193,14 +200,26 @@ def torque_share(problem: Problem, series: FourierSeries, t: Array, smooth: Arra
 
 def regressor_rows(model: Model, motion: tuple[Array, ...], smooth: Array | None, period: float) -> Array:
     """(N, n, p) regressor; dry friction changes sign within a share `smooth` of the largest velocity."""
-    (q, dq, ddq), one_joint = motion, model.n_joints == 1
-    rate = len(q) / period
-    if smooth is not None:
-        width = jnp.maximum(smooth * jnp.abs(dq).max(axis=0), jnp.finfo(dq.dtype).eps)  # at rest it would vanish
-        model = model.smoothed(width[0] if one_joint else width)
-    if one_joint:
+    (q, dq, ddq), rate = motion, len(motion[0]) / period
+    model = _smoothed(model, dq, smooth)
+    if model.n_joints == 1:
         return model.over_period(q[:, 0], dq[:, 0], ddq[:, 0], rate)[:, None]
     return model.over_period(q, dq, ddq, rate)
+
+
+def torque_of(problem: Problem, motion: tuple[Array, ...], smooth: Array | None) -> Array:
+    """(N, n) torque of everything that is moved."""
+    assert problem.parameters is not None
+    if problem.moved.memory or problem.n == 1:
+        return regressor_rows(problem.moved, motion, smooth, problem.period) @ problem.parameters
+    return _smoothed(problem.moved, motion[1], smooth).torque(problem.parameters, *motion)
+
+
+def _smoothed(model: Model, dq: Array, smooth: Array | None) -> Model:
+    if smooth is None:
+        return model
+    width = jnp.maximum(smooth * jnp.abs(dq).max(axis=0), jnp.finfo(dq.dtype).eps)  # at rest it would vanish
+    return model.smoothed(width[0] if model.n_joints == 1 else width)
 
 
 def measured_motion(encoder: Encoder, series: FourierSeries, t: Array) -> tuple[Array, ...]:
@@ -229,14 +248,28 @@ def _grams(
     if problem.encoder is not None:
         t = jnp.arange(round(problem.samples)) / problem.encoder.sample_rate
         motion = measured_motion(problem.encoder, series, t)
-    rows = regressor_rows(problem.model, motion, smooth, problem.period) * problem.scale
-    share = problem.samples / len(t)
+    return grams_of(problem, regressor_rows(problem.model, motion, smooth, problem.period), whole, every)
+
+
+def grams_of(problem: Problem, rows: Array, whole: bool = False, every: int = 1) -> Array:
+    """The same from the regressor (N, n, p) of evenly spread instants."""
+    rows, count = rows * problem.scale, len(rows)
+    share = problem.samples / count
     if problem.window is None or whole:
         rows = rows.reshape(-1, rows.shape[-1])
-        return (share * (rows.T @ rows))[None]
-    products = share * jnp.einsum("tni,tnj->tij", rows, rows)
-    length = max(1, round(problem.window * len(t)))
-    return sliding_sums(products, length)[:: max(1, length // every) if every > 1 else 1]
+        grams = (share * (rows.T @ rows))[None]
+    else:
+        products = share * jnp.einsum("tni,tnj->tij", rows, rows)
+        length = max(1, round(problem.window * count))
+        grams = sliding_sums(products, length)[:: max(1, length // every) if every > 1 else 1]
+    return of_unit_columns(grams) if problem.unit else grams
+
+
+def of_unit_columns(grams: Array) -> Array:
+    """Gram matrices (M, p, p) of the same columns at unit norm."""
+    size = jnp.sqrt(jnp.diagonal(grams, axis1=-2, axis2=-1))
+    size = jnp.where(size > 0, size, 1.0)
+    return grams / (size[:, :, None] * size[:, None, :])
 
 
 def sliding_sums(products: AnyArray, length: int) -> Array:
@@ -248,14 +281,19 @@ def sliding_sums(products: AnyArray, length: int) -> Array:
 
 def worth_of(problem: Problem, series: FourierSeries, t: Array, smooth: Array | None, sharpness: Array | None) -> Array:
     """Logarithm of the objective, the smaller the better; of the worst window a smooth maximum."""
+    every = 1 if sharpness is None else DESCENDING
+    return worth_of_grams(problem, _grams(problem, series, t, smooth, every=every), sharpness)
+
+
+def worth_of_grams(problem: Problem, grams: Array, sharpness: Array | None) -> Array:
+    """The same from the Gram matrices of all windows."""
     objectives: dict[str, Callable[[Array], Array]] = {
         "condition": log_condition,
         "determinant": log_volume,
         "sigma_min": log_sigma_min,
         "stderr": partial(log_stderr, parameter=problem.parameter),
     }
-    every = 1 if sharpness is None else DESCENDING
-    values = objectives[problem.objective](_grams(problem, series, t, smooth, every=every))
+    values = objectives[problem.objective](grams)
     return values.max() if sharpness is None else jax.nn.logsumexp(sharpness * values) / sharpness
 
 
@@ -293,12 +331,12 @@ def _rests(problem: Problem, count: int, random: np.random.Generator) -> Numbers
 def _farthest(problem: Problem, x: Array) -> Array:
     """How far each motion goes, as a share of the limit that it comes closest to."""
     t = problem.instants()
-    return jax.vmap(lambda x: shares_reached(problem, _direction(problem, x), t).max())(x)
+    return jax.vmap(lambda x: shares_reached(problem, direction_of(problem, x), t).max())(x)
 
 
 @eqx.filter_jit
 def _shares_at_rest(problem: Problem, x: Array) -> Array:
-    return jax.vmap(lambda x: torque_share(problem, _direction(problem, x), jnp.zeros(1), None))(x)
+    return jax.vmap(lambda x: torque_share(problem, direction_of(problem, x), jnp.zeros(1), None))(x)
 
 
 def descend(problem: Problem, x: Array, method: str, progress: Progress) -> Array:
@@ -344,7 +382,7 @@ def _linear_limits(problem: Problem) -> tuple[Array, Array]:
     t, size = problem.instants(), problem.n * (2 * problem.harmonics + 1)
 
     def reached(x: Array) -> Array:
-        series = _direction(problem, x)
+        series = direction_of(problem, x)
         q, dq, ddq = series(t)
         return jnp.stack([q - series.offset, dq, ddq, jerk(series, t)])
 
@@ -357,25 +395,48 @@ def _linear_limits(problem: Problem) -> tuple[Array, Array]:
     return jnp.concatenate([A[kept], -A[kept]]), jnp.concatenate([b[kept], b[kept]])
 
 
-def judged(problem: Problem, x: Array) -> tuple[FourierSeries, float, float, float]:
-    """The motion on the fine grid, its objective, its condition number over the period and in the worst window."""
+class Motion(NamedTuple):
+    """A finished motion, and what it is worth."""
+
+    series: FourierSeries
+    value: float
+    """Logarithm of the objective, infinite where a limit is not kept."""
+    condition: float
+    """Condition number over the period."""
+    worst: float
+    """Condition number in the worst window."""
+    unit: float | None = None
+    """Condition number over the period of columns of unit norm."""
+
+
+def judged(problem: Problem, x: Array) -> Motion:
+    """The motion on the fine grid."""
     series, *numbers = _judge(problem, x)
-    single = problem.n == 1
+    return Motion(as_given(problem, series), *(float(number) for number in numbers))
+
+
+def as_given(problem: Problem, series: FourierSeries) -> FourierSeries:
+    """In numpy, and without an axis of joints where there is only one."""
     sine, cosine, offset = (np.asarray(x) for x in (series.sine, series.cosine, series.offset))
-    if single:
+    if problem.n == 1:
         sine, cosine, offset = sine[0], cosine[0], offset[0]
-    return FourierSeries(sine, cosine, offset, problem.period), *(float(number) for number in numbers)  # type: ignore[return-value]
+    return FourierSeries(sine, cosine, offset, problem.period)
 
 
 @eqx.filter_jit
 def _judge(problem: Problem, x: Array) -> tuple[FourierSeries, Array, Array, Array]:
     t = problem.instants(FINER)
     series, _ = feasible_motion(problem, x, problem.instants(), None)
-    series = _times(series, 1 / jnp.maximum(shares_reached(problem, series, t).max() * (1 + ROUNDING), 1.0))
+    series = times(series, 1 / jnp.maximum(shares_reached(problem, series, t).max() * (1 + ROUNDING), 1.0))
     excess = jnp.zeros(())
     if problem.parameters is not None:
         series, excess = _within_torque(problem, series, t, None)
     value = jnp.where(excess > 0, jnp.inf, worth_of(problem, series, t, None, None))
-    plain = eqx.tree_at(lambda p: p.scale, problem, jnp.ones_like(problem.scale))
+    plain = in_si(problem)
     windows = log_condition(_grams(plain, series, t, None))
     return series, value, jnp.exp(log_condition(_grams(plain, series, t, None, whole=True)))[0], jnp.exp(windows.max())
+
+
+def in_si(problem: Problem) -> Problem:
+    """The same with columns as they are."""
+    return replace(problem, scale=jnp.ones_like(problem.scale), unit=False)

@@ -116,6 +116,8 @@ class Chain(Model):
     rotor: bool = eqx.field(static=True)
     offset: bool = eqx.field(static=True)
     _limits: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    _leaders: tuple[int, ...] = eqx.field(static=True)
+    _frames: tuple[tuple[str, int, tuple[float, ...], tuple[float, ...]], ...] = eqx.field(static=True)
     _digest: str = eqx.field(static=True)
 
     def __init__(
@@ -147,6 +149,11 @@ class Chain(Model):
         self.n_joints, self.robot, self.label = len(names), robot.robot, "robot"
         self.link_names = tuple(body.links for body in found.bodies)
         self._limits = tuple(tuple(getattr(joint.limits, key) for joint in leaders) for key in JointLimits._fields)
+        self._leaders = tuple(k for k, body in enumerate(found.bodies) if body.joint.mimic is None)
+        self._frames = tuple(
+            (link, at.body, tuple(at.rotation.ravel().tolist()), tuple(at.position.tolist()))
+            for link, at in found.frames.items()
+        )
         self.terms, self.rotor, self.offset = friction_terms(friction), rotor, offset
 
         ratio = _per_joint("gear", gear, 1.0, names, np.not_equal, "not zero")
@@ -232,6 +239,31 @@ class Chain(Model):
         """What the URDF allows each joint."""
         return JointLimits(*(np.array(values) for values in self._limits))
 
+    @property
+    def recorded_limits(self) -> JointLimits:
+        """The same for positions, velocities and torques as they are recorded: at the motors, with their signs and
+        zeros.
+
+        **Raises:** `ValueError` where motors share joints: then the limits of one depend on the position of another.
+        """
+        turns, zero = (np.asarray(x)[list(self._leaders)] for x in (self.tree.coordinates, self.tree.zero))
+        each = np.diag(turns)
+        if np.count_nonzero(turns) > self.n_joints:
+            raise ValueError(f"{self.robot} has motors that share joints: give the limits of the motors' motion")
+        at_joints = self.limits
+        ends = [(end - zero) / each for end in (at_joints.lower, at_joints.upper)]
+        return JointLimits(
+            np.minimum(*ends), np.maximum(*ends), at_joints.velocity / abs(each), at_joints.effort * abs(each)
+        )
+
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """Where each of the URDF's links is fixed: to which body (-1 for the base), how turned and where."""
+        return {
+            link: Frame(body, np.reshape(rotation, (3, 3)), np.array(position))
+            for link, body, rotation, position in self._frames
+        }
+
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         widths = jnp.broadcast_to(jnp.asarray(width), (self.n_joints,))
         return eqx.tree_at(lambda chain: chain.width, self, widths, is_leaf=lambda x: x is None)
@@ -316,6 +348,22 @@ class Chain(Model):
             return rigid_body.over_samples(_lanes, self.n_joints, self, *motion)
         return rigid_body.over_samples(_lanes, 1, self, *(x[..., None] for x in motion))[..., 0, :]
 
+    def torque(
+        self,
+        theta: Num[ArrayLike, " p"],
+        q: Num[ArrayLike, "..."],
+        dq: Num[ArrayLike, "..."],
+        ddq: Num[ArrayLike, "..."],
+    ) -> Float[Array, "..."]:
+        """Torque [N m or N] that base parameters `theta` give: `regressor @ theta`, without its columns."""
+        if jnp.shape(theta) != (len(self.names),):
+            raise ValueError(f"theta has the shape {jnp.shape(theta)}: give {len(self.names)} base parameters")
+        motion = self._checked(q, dq, ddq)
+        if self.n_joints > 1:
+            return rigid_body.over_samples(_own_torque_lanes, self.n_joints, (self, jnp.asarray(theta)), *motion)
+        one = (x[..., None] for x in motion)
+        return rigid_body.over_samples(_own_torque_lanes, 1, (self, jnp.asarray(theta)), *one)[..., 0]
+
     def _require_tip(self) -> None:
         if self.tip is None:
             raise ValueError(f"{self.robot} branches, and no tip was named: pass tip= with one of its links")
@@ -365,6 +413,18 @@ def _lanes(chain: Chain, q: Array, dq: Array, ddq: Array) -> Array:
     return _columns(chain, chain.tree, chain.stribeck, chain.base.kept, q, dq, ddq, jnp).swapaxes(0, 1)
 
 
+def _own_torque_lanes(parts: tuple[Chain, Array], q: Array, dq: Array, ddq: Array) -> Array:
+    """(n, N) of base parameters."""
+    chain, theta = parts
+    links = 10 * chain.tree.n_bodies
+    standard = jnp.zeros(len(chain.base.standard_names), theta.dtype).at[jnp.array(chain.base.kept)].set(theta)
+    torque = rigid_body.torque_lanes((chain.tree, standard[:links].reshape(-1, 10)), q, dq, ddq)
+    groups = _joint_columns(chain, chain.stribeck, dq, ddq, jnp)
+    for (share, value), own in zip(groups, standard[links:].reshape(-1, chain.n_joints), strict=True):
+        torque = torque + share.T @ (own[:, None] * value)
+    return torque
+
+
 def _columns(
     chain: Chain,
     tree: KinematicTree,
@@ -377,12 +437,7 @@ def _columns(
 ) -> AnyArray:
     """(p, n, N) of the standard columns that are kept, for motions (n, N) and a Stribeck `curve`."""
     n, rigid = chain.n_joints, rigid_body.regressor_columns(tree, q, dq, ddq, xp)
-    speed, change = chain.motors @ dq, chain.motors @ ddq
-    sign = xp.sign(speed) if chain.width is None else _gradual_sign(speed, chain.width[:, None], xp)
-    at = Speed(speed, sign, (curve[0][:, None], curve[1][:, None]), xp)
-    values = [change] * chain.rotor + [term.value(at) for term in chain.terms]
-    # Column k of `motors`' transpose is what the torque of motor k does to the coordinates.
-    groups = [(chain.motors, value) for value in values] + [(xp.eye(n), xp.ones_like(q))] * chain.offset
+    groups = _joint_columns(chain, curve, dq, ddq, xp)
 
     def column(k: int) -> AnyArray:
         if k < 10 * tree.n_bodies:
@@ -392,6 +447,18 @@ def _columns(
         return share[joint][:, None] * value[joint]
 
     return xp.stack([column(k) for k in kept])
+
+
+def _joint_columns(
+    chain: Chain, curve: tuple[AnyArray, AnyArray], dq: AnyArray, ddq: AnyArray, xp: ModuleType
+) -> list[tuple[AnyArray, AnyArray]]:
+    """Of every parameter that each joint has one of: row k is what the torque of motor k does to the coordinates, and
+    (n, N) the motors' torques for a parameter of one."""
+    speed, change = chain.motors @ dq, chain.motors @ ddq
+    sign = xp.sign(speed) if chain.width is None else _gradual_sign(speed, chain.width[:, None], xp)
+    at = Speed(speed, sign, (curve[0][:, None], curve[1][:, None]), xp)
+    values = [change] * chain.rotor + [term.value(at) for term in chain.terms]
+    return [(chain.motors, value) for value in values] + [(xp.eye(chain.n_joints), xp.ones_like(dq))] * chain.offset
 
 
 def _gradual_sign(speed: AnyArray, width: AnyArray, xp: ModuleType) -> AnyArray:

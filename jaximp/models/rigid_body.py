@@ -124,7 +124,7 @@ def inverse_dynamics(
     **Arguments:** `theta` ten parameters of each body about the origin of its frame, in the order of
     `spatial.PARAMETERS`; positions, velocities and accelerations.
     """
-    return over_samples(_torque_lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq, ddq)
+    return over_samples(torque_lanes, tree.n_joints, (tree, jnp.asarray(theta)), q, dq, ddq)
 
 
 def mass_matrix(
@@ -202,7 +202,7 @@ def jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
     return jnp.stack([*_turned(turn, linear), *_turned(turn, angular)])
 
 
-def _torque_lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array, ddq: Array) -> Array:
+def torque_lanes(parts: tuple[KinematicTree, Array], q: Array, dq: Array, ddq: Array) -> Array:
     tree, theta = parts
     axes, (o, b, a) = _axes(tree, q, jnp), _motion(tree, q, dq, ddq, jnp)
     mass, moment, inertia = _split(theta[:, :, None])

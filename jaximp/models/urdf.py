@@ -126,6 +126,11 @@ def read_urdf(path: str | Path) -> Urdf:
     a document type or entities, a joint without an axis, parts that do not hang together, a closed loop.
     """
     path = Path(path)
+    return parse_urdf(text_of(path), str(path))
+
+
+def text_of(path: Path) -> str:
+    """What stands in a URDF file. **Raises:** `ValueError` for a file that cannot be read, is too large, or no text."""
     try:
         size = path.stat().st_size
         raw = path.read_bytes() if size <= LARGEST_FILE else b""
@@ -134,15 +139,14 @@ def read_urdf(path: str | Path) -> Urdf:
     if size > LARGEST_FILE:
         raise ValueError(f"{path} has {size} bytes: a URDF has at most {LARGEST_FILE}; meshes belong in other files")
     try:
-        text = raw.decode("utf-8-sig")
+        return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{path} is no text in UTF-8: save it as such") from None
-    return parse_urdf(text, str(path))
 
 
 def parse_urdf(text: str, source: str = "the URDF") -> Urdf:
     """The text of a URDF file as links and joints; errors call it `source`. As `read_urdf`."""
-    root = _root(text, source)
+    root = root_of(text, source)
     read = _Reader(source)
     links = {read.name(element): read.inertia(element) for element in read.all(root, "link")}
     joints = tuple(read.joint(element) for element in read.all(root, "joint"))
@@ -199,7 +203,7 @@ def require_known(source: str, keyword: str, thing: str, name: str, known: Itera
         raise ValueError(f"{source}: {keyword} is '{name}', but no {thing} is called so: {nearest(name, known)}")
 
 
-def _root(text: str, source: str) -> ET.Element:
+def root_of(text: str, source: str) -> ET.Element:
     """The `<robot>`. What could expand or fetch something is refused before anything is parsed."""
     for mark, what in {"<!DOCTYPE": "a document type", "<!ENTITY": "entities"}.items():
         if mark in text:

@@ -1,7 +1,9 @@
 """One face for the optimisers: many starts at a time, minimised in one compiled call.
 
 optimistix is the rule. jaxopt, which is no longer maintained, adds two ways that it lacks; nothing else imports it.
-Which of them is the default for what was measured: experiments/benchmarks/excitation.py.
+One way is driven from Python: it compiles the objective once, where the others have several copies of it in one
+program, which a robot's regressor makes minutes of. Which of them is the default for what was measured:
+experiments/benchmarks/excitation.py and chain_excitation.py.
 """
 
 from __future__ import annotations
@@ -14,8 +16,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
+
+from jaximp.types import Numbers
 
 Objective = Callable[[Array], Array]
 Projection = Callable[[Array], Array]
@@ -25,7 +30,15 @@ METHODS = {
     "conjugate_gradient": "optimistix nonlinear conjugate gradient",
     "lbfgsb": "jaxopt bounded limited-memory BFGS",
     "projected_gradient": "jaxopt projected gradient; the projection solves a quadratic program",
+    "python": "BFGS driven from Python",
 }
+
+ENOUGH = 1e-4
+"""A step must lower the value by such a share of what the slope promises."""
+STEEP = 0.9
+"""A step is too short where the value still falls by more than this share of the slope at its beginning."""
+SHORTEST = 1e-10
+"""Steps that are cut shorter lead nowhere."""
 
 
 class Found(NamedTuple):
@@ -54,6 +67,8 @@ def minimise(
     """
     if method not in METHODS:
         raise ValueError(f"method is '{method}': there are {', '.join(METHODS)}")
+    if method == "python":
+        return descend_from_python(jax.jit(jax.value_and_grad(objective)), starts, max_steps, tolerance)
     if method in ("bfgs", "conjugate_gradient"):
         one = partial(_optimistix, objective, method, max_steps, tolerance)
     else:
@@ -71,6 +86,83 @@ def _optimistix(objective: Objective, method: str, max_steps: int, tolerance: fl
         lambda x, _: objective(x), solver, start, max_steps=max_steps, throw=False
     )
     return Found(solution.value, objective(solution.value), solution.stats["num_steps"])
+
+
+def descend_from_python(
+    value_and_slope: Callable[[Array], tuple[Array, Array]],
+    starts: Float[Array, "m d"],
+    max_steps: int = 500,
+    tolerance: float = 1e-9,
+) -> Found:
+    """BFGS from one start after the other; `value_and_slope` is compiled already.
+
+    It ends where a step lowers the value by less than the `tolerance`, or where none does. Starts do not run side by
+    side: two compiled programs that decompose batches of matrices can wait for each other for ever.
+    """
+
+    def both(x: Numbers) -> tuple[float, Numbers]:
+        value, slope = value_and_slope(jnp.asarray(x))
+        return float(value), np.asarray(slope)
+
+    found = [_bfgs(both, start, max_steps, tolerance) for start in np.asarray(starts)]
+    x, values, steps = zip(*found, strict=True)
+    return Found(jnp.asarray(np.array(x)), jnp.asarray(values), jnp.asarray(steps))
+
+
+def _bfgs(
+    both: Callable[[Numbers], tuple[float, Numbers]], x: Numbers, max_steps: int, tolerance: float
+) -> tuple[Numbers, float, int]:
+    """Nocedal and Wright 2006, algorithm 6.1, with steps that are cut until they lower the value enough.
+
+    scipy's multiplies matrices at every step, for which threads wait for each other from a hundred numbers on. Sums of
+    einsum, as here, are those of one thread.
+    """
+    value, slope = both(x)
+    inverse: Numbers | None = None  # of the second derivatives
+    for step in range(max_steps):
+        if inverse is None:
+            direction = -slope / max(1.0, float(np.linalg.norm(slope)))
+        else:
+            direction = -np.einsum("ij,j->i", inverse, slope)
+        length, ahead, slope_ahead = _step(both, x, value, direction, float(slope @ direction))
+        if length == 0:
+            return x, value, step
+        gone, change, gain = length * direction, slope_ahead - slope, value - ahead
+        x, value, slope = x + gone, ahead, slope_ahead
+        if gain < tolerance:
+            return x, value, step + 1
+        bend = float(gone @ change)
+        if bend > 1e-10 * float(np.linalg.norm(gone) * np.linalg.norm(change)):
+            if inverse is None:
+                inverse = bend / float(change @ change) * np.eye(len(x))
+            image = np.einsum("ij,j->i", inverse, change)
+            mixed = np.multiply.outer(gone, image / bend)
+            inverse += (1 + float(change @ image) / bend) / bend * np.multiply.outer(gone, gone) - mixed - mixed.T
+    return x, value, max_steps
+
+
+def _step(
+    both: Callable[[Numbers], tuple[float, Numbers]], x: Numbers, value: float, direction: Numbers, along: float
+) -> tuple[float, float, Numbers]:
+    """How far to go, and value and slope there: cut until the value is low enough, or doubled while it falls steeply.
+
+    Zero where no step lowers the value.
+    """
+    length = 1.0
+    ahead, slope = both(x + direction)
+    while not ahead <= value + ENOUGH * length * along:
+        # The bottom of the parabola through both values and the slope.
+        cut = -along * length / (2 * (ahead - value - along * length)) if np.isfinite(ahead) else 0.0
+        length *= min(max(cut, 0.1), 0.5)
+        if not length > SHORTEST:
+            return 0.0, value, slope
+        ahead, slope = both(x + length * direction)
+    while length >= 1 and slope @ direction < STEEP * along:
+        farther, slope_farther = both(x + 2 * length * direction)
+        if not farther < min(ahead, value + ENOUGH * 2 * length * along):
+            break
+        length, ahead, slope = 2 * length, farther, slope_farther
+    return length, ahead, slope
 
 
 def _jaxopt(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from textwrap import fill
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,6 +13,8 @@ from jaximp.design.excitation import Design
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.plots.style import BLACK, LINES, WIDTH, draw_line, styled
 
+TITLE = 95
+"""Letters of a title's line."""
 UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
 
 
@@ -23,7 +28,7 @@ def design(found: Design) -> Figure:
     *axes, spectrum, condition = figure.subplots(len(names) + 2, 1)
     for axis, name in zip(axes, names, strict=True):
         for j, x in enumerate(motion[name].reshape(len(motion["time"]), n).T):
-            color, style = LINES[j % len(LINES)]
+            color, style = _line(j)
             draw_line(axis, motion["time"], x, color=color, linestyle=style, label=f"joint {j + 1}")
         limit = getattr(found.limits, name)
         ends = limit if name == "position" else (-np.asarray(limit), np.asarray(limit))
@@ -32,7 +37,8 @@ def design(found: Design) -> Figure:
                 axis.axhline(value, color=BLACK, linestyle=":", linewidth=0.8)
         axis.set(ylabel=f"{name}\n({UNITS[name]})", xlim=(0, found.period))
         axis.tick_params(labelbottom=axis is axes[-1])
-    axes[0].set_title(f"One period; dotted: limits. Reached: {', '.join(found.active) or 'none'}")
+    title = fill(f"One period; dotted: limits. Reached: {found.limits_reached()}", TITLE)
+    axes[0].set_title(title)
     axes[-1].set_xlabel("time (s)")
     if n > 1:
         axes[0].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
@@ -41,13 +47,19 @@ def design(found: Design) -> Figure:
     return figure
 
 
+def _line(j: int) -> tuple[str, Any]:
+    """Color and dashes of a joint; more joints than colors have them again with other dashes."""
+    return LINES[j % len(LINES)][0], LINES[(j + j // len(LINES)) % len(LINES)][1]
+
+
 def _harmonics(panel: Axes, series: FourierSeries) -> None:
     amplitude = np.atleast_2d(np.hypot(series.sine, series.cosine))
     count, period = amplitude.shape[1], float(series.period)
     frequency = np.arange(1, count + 1) / period
     width = 0.8 / len(amplitude) / period
     for j, row in enumerate(amplitude):
-        panel.bar(frequency + (j - (len(amplitude) - 1) / 2) * width, row, width, color=LINES[j % len(LINES)][0])
+        at = frequency + (j - (len(amplitude) - 1) / 2) * width
+        panel.bar(at, row, width, color=_line(j)[0], hatch="////" * (j // len(LINES)), edgecolor="white", linewidth=0)
     panel.set(title="Amplitude of the velocity", xlabel="frequency (Hz)", ylabel="velocity (rad/s)")
     panel.set_xlim(0, (count + 1) / period)
 

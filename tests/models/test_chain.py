@@ -302,6 +302,18 @@ def test_motors_do_the_work_of_the_joints() -> None:
 # Friction.
 
 
+def test_torque_without_columns_is_that_of_the_columns() -> None:
+    settings: dict[str, Any] = {"friction": ALL, "rotor": True, "offset": True, "gear": 3.0, "coupling": COUPLED}
+    for side in ("motor", "joint"):
+        chain = Chain(parse_urdf(GANTRY), side=side, **settings)
+        theta = np.random.default_rng(1).normal(size=len(chain.names))
+        z, dz, ddz = motion(3, 20)
+        expected = chain.observation_matrix(z, dz, ddz) @ theta
+        np.testing.assert_allclose(chain.torque(theta, z, dz, ddz), expected, rtol=1e-10, atol=1e-10)
+    with pytest.raises(ValueError, match=r"theta has the shape \(2,\)"):
+        chain.torque(theta[:2], z, dz, ddz)
+
+
 def test_friction_of_the_file_comes_with_its_columns() -> None:
     chain = Chain.from_urdf(SIX_JOINT_ARM, friction=True)
     damping, friction = [2.6, 3.1, 1.7, 0.62, 0.55, 0.21], [3.8, 4.9, 2.7, 0.9, 0.85, 0.4]
