@@ -6,7 +6,8 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaximp.consistency import ConsistentFit, Exported, Ranges, consistent_fit, consistent_ranges, export_urdf
+from jaximp.consistency.export import Exported, export_urdf
+from jaximp.consistency.programs import ConsistentFit, Ranges, consistent_fit, consistent_ranges
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import in_windows
 from jaximp.identification.whole import whole_recording
