@@ -70,9 +70,9 @@ class Selected(Model):
 
 
 class Load(Model):
-    """The ten inertial parameters of a body that is fixed to the last link of a chain, on top of the robot's own.
+    """The ten inertial parameters of a body that is fixed to the tip of a chain, on top of the robot's own.
 
-    They belong to the frame of the link that the last joint moves, as the link's own (`spatial.PARAMETERS`).
+    They belong to the frame of the tip, as those of `identification.identify_payload`.
 
     **Raises:** `ValueError` for a chain with branches of which no link was named as the tip.
     """
@@ -98,10 +98,13 @@ class Load(Model):
     ) -> Float[Array, "... p"]:
         motion = self._checked(q, dq, ddq)
         if self.n_joints > 1:
-            return rigid_body.over_samples(_load_lanes, self.n_joints, self.robot.tree, *motion)
-        return rigid_body.over_samples(_load_lanes, 1, self.robot.tree, *(x[..., None] for x in motion))[..., 0, :]
+            of_link = rigid_body.over_samples(_link_lanes, self.n_joints, self.robot.tree, *motion)
+        else:
+            of_link = rigid_body.over_samples(_link_lanes, 1, self.robot.tree, *(x[..., None] for x in motion))
+            of_link = of_link[..., 0, :]
+        return of_link @ self.robot.load_in_link
 
 
-def _load_lanes(tree: rigid_body.KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:
-    """(n, 10, N)"""
+def _link_lanes(tree: rigid_body.KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:
+    """(n, 10, N) of the link that bears the load."""
     return jnp.stack([column[tree.tip_body] for column in rigid_body.regressor_columns(tree, q, dq, ddq)], axis=1)

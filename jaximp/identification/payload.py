@@ -25,7 +25,7 @@ from jaximp.identification.quantities import Quantities, freedom
 from jaximp.identification.rows import Rows, measure, regress
 from jaximp.identification.separation import OTHER_MOTION
 from jaximp.models.chain import Chain
-from jaximp.models.spatial import PARAMETERS, moved
+from jaximp.models.spatial import PARAMETERS
 from jaximp.recordings.join import part_of
 from jaximp.results import Parameter
 from jaximp.types import AnyArray, Numbers, Recording, listed
@@ -229,11 +229,8 @@ def rows_of(pipeline: Pipeline, several: Sequence[Recording]) -> Rows:
 
 def load_columns(chain: Chain) -> Numbers:
     """(p, 10) what the parameters of a load, in the frame of the tip, add to the base parameters of a chain."""
-    tree = chain.tree
-    turned = np.asarray(tree.tip_rotation, float), np.asarray(tree.tip_position, float)
-    in_body = np.stack([moved(one, *turned) for one in np.eye(10)], axis=1)
-    first = 10 * tree.tip_body
-    return np.asarray(chain.base.map, float)[:, first : first + 10] @ in_body
+    first = 10 * chain.tree.tip_body
+    return np.asarray(chain.base.map, float)[:, first : first + 10] @ chain.load_in_link
 
 
 def gains_of(several: Sequence[Recording]) -> Numbers | None:

@@ -20,7 +20,7 @@ from jaximp.models.base_parameters import BaseParameters, find_base
 from jaximp.models.friction import Speed, Term, friction_terms
 from jaximp.models.joint import parameter_units
 from jaximp.models.rigid_body import KinematicTree
-from jaximp.models.spatial import PARAMETERS
+from jaximp.models.spatial import PARAMETERS, moved
 from jaximp.models.urdf import Bodies, Frame, Joint, Urdf, following, moving_bodies, read_urdf, require_known
 from jaximp.types import AnyArray, Numbers
 
@@ -233,6 +233,13 @@ class Chain(Model):
     def sums(self) -> dict[str, str]:
         """What each base parameter stands for, such as `link2.mc_x + 0.612 link3.mass`."""
         return self.base.sums
+
+    @property
+    def load_in_link(self) -> Numbers:
+        """(10, 10) what a body at the tip, by its parameters in the tip's frame, adds to those of the link that bears
+        it."""
+        frame = np.asarray(self.tree.tip_rotation, float), np.asarray(self.tree.tip_position, float)
+        return np.stack([moved(one, *frame) for one in np.eye(10)], axis=1)
 
     @property
     def limits(self) -> JointLimits:

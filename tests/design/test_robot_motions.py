@@ -160,10 +160,13 @@ def test_a_load_is_what_it_adds_to_the_torque(chain: Chain) -> None:
     load = np.array([1.2, 0.1, -0.05, 0.2, 0.03, 0.001, 0.04, 0.002, -0.003, 0.02])
     q, dq, ddq = np.random.default_rng(0).normal(size=(3, 20, 2))
     links = np.array(chain.links)
-    heavy = links + np.array([np.zeros(10), load])
+    heavy = links + np.array([np.zeros(10), chain.load_in_link @ load])
     more = rigid_body.inverse_dynamics(chain.tree, heavy, q, dq, ddq) - chain.inverse_dynamics(q, dq, ddq)
     model = Load(chain)
     assert model.names[0] == "load.mass"
+    still = np.zeros_like(q)
+    weight = -np.einsum("ban,a->bn", np.asarray(chain.jacobian(q))[:, :3], np.asarray(chain.tree.gravity))
+    np.testing.assert_allclose(model.observation_matrix(q, still, still)[..., 0], weight, atol=1e-12)
     np.testing.assert_allclose(model.observation_matrix(q, dq, ddq) @ load, more, atol=1e-12)
     with pytest.raises(ValueError, match="bears a load"):
         Load(Chain(parse_urdf(TEXT), tip="base"))
