@@ -55,9 +55,11 @@ class Quantities(Result):
 def freedom(*parts: tuple[AnyArray, AnyArray]) -> Numbers:
     """(p,) degrees of freedom of a sum of variances, by Welch and Satterthwaite.
 
-    **Arguments:** variances (p,) that are independent, each with its degrees of freedom.
+    **Arguments:** variances (p,) that are independent, each with its degrees of freedom, which do not matter where a
+    variance is zero.
     """
-    total = sum(np.asarray(variance, float) for variance, _ in parts)
-    uncertain = sum(np.asarray(variance, float) ** 2 / dof for variance, dof in parts)
+    variances = [(np.asarray(variance, float), np.asarray(dof, float)) for variance, dof in parts]
+    total = sum(variance for variance, _ in variances)
     with np.errstate(divide="ignore", invalid="ignore"):
+        uncertain = sum(np.where(variance > 0, variance**2 / dof, 0.0) for variance, dof in variances)
         return np.asarray(total**2 / uncertain, float)

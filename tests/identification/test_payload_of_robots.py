@@ -131,6 +131,15 @@ def test_gains_are_carried_into_the_mass() -> None:
         identify_payload(PIPELINE, alone, [loaded, replace(loaded, gain_covariance=np.eye(2))])
 
 
+def test_quite_the_same_motion_leaves_nothing_of_the_robot() -> None:
+    """By method 3: then errors are those of the torques alone."""
+    alone, loaded = pair(12, 3)
+    found = identify_payload(PIPELINE, alone, replace(loaded, position=alone.position), 3)
+    low, high = found.mass.interval()
+    assert low < 0.7 < high
+    assert np.isfinite(found.dof[SEEN]).all()
+
+
 def test_words_say_what_is_determined() -> None:
     words = identify_payload(PIPELINE, *pair(5, noise=0.3)).in_words()
     assert words[0].startswith("mass 0.")
