@@ -6,14 +6,18 @@ import typer
 
 from jaximp.cli.terminal import Force, JobFile, Out, bar_of
 
+POINTS = 50.0
+"""Of a robot's path that are drawn [1/s]."""
+
 
 def design(job_file: JobFile, out: Out, force: Force = False) -> None:
     """Design a motion that excites every parameter, within the limits of joint and robot.
 
-    Writes trajectory.csv, trajectory.json, trajectory.yaml (a ROS JointTrajectory), summary.json and the figure.
+    Writes trajectory.csv, trajectory.json, trajectory.yaml (a ROS JointTrajectory), summary.json and the figures.
     """
     from jaximp.design.files import write_design
     from jaximp.jobs.design import read_design_job
+    from jaximp.models.chain import Chain
     from jaximp.recordings.outputs import new_folder
 
     job = read_design_job(job_file)
@@ -23,6 +27,9 @@ def design(job_file: JobFile, out: Out, force: Force = False) -> None:
         from jaximp import plots
 
         (folder / "trajectory.png").write_bytes(plots.png(plots.design(found)))
+        moved = found.moved or found.model
+        if isinstance(moved, Chain):
+            (folder / "robot.png").write_bytes(plots.png(plots.robot(moved, found.sampled(POINTS)["position"])))
         progress(1.0)
     for line in found.in_words():
         typer.echo(line)

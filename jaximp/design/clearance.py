@@ -195,7 +195,7 @@ def segment_distance(a: Float[Array, "2 3 *N"], b: Float[Array, "2 3 *N"]) -> Fl
 
 def _distance_lanes(clearance: Clearance, q: Array) -> Array:
     """(C, N)"""
-    R, p = rigid_body._poses(clearance.tree, q)
+    R, p = rigid_body.body_poses(clearance.tree, q)
     turned, origin = jnp.stack([jnp.stack(row) for row in R]), jnp.stack(p)  # (3, 3, n_b, N), (3, n_b, N)
     own = jnp.asarray(clearance.ends)
     moves = np.array(clearance.bodies) >= 0

@@ -104,6 +104,13 @@ def forward_kinematics(
     return over_samples(pose_lanes, tree.n_joints, tree, q)
 
 
+def body_frames(
+    tree: KinematicTree, q: Num[ArrayLike, "... n"]
+) -> tuple[Float[Array, "... n_b 3 3"], Float[Array, "... n_b 3"]]:
+    """Where all bodies are: rotations from their frames to the base's, and their origins [m]."""
+    return over_samples(_frame_lanes, tree.n_joints, tree, q)
+
+
 def jacobian(tree: KinematicTree, q: Num[ArrayLike, "... n"]) -> Float[Array, "... 6 n"]:
     """Velocity of the tip (rows 1 to 3) and its angular velocity (4 to 6) for each coordinate's velocity.
 
@@ -186,8 +193,14 @@ def regressor_columns(
 
 def pose_lanes(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
     """`forward_kinematics` (3, 3, N) and (3, N)."""
-    R, p = _tip(tree, *_poses(tree, q))
+    R, p = _tip(tree, *body_poses(tree, q))
     return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(p)
+
+
+def _frame_lanes(tree: KinematicTree, q: Array) -> tuple[Array, Array]:
+    """(n_b, 3, 3, N) and (n_b, 3, N)."""
+    R, p = body_poses(tree, q)
+    return jnp.stack([jnp.stack(row, axis=1) for row in R], axis=1), jnp.stack(p, axis=1)
 
 
 def jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
@@ -195,7 +208,7 @@ def jacobian_lanes(tree: KinematicTree, q: Array) -> Array:
     if tree.tip_body < 0:
         return jnp.zeros((6, *q.shape), q.dtype)
     axes = _axes(tree, q, jnp)
-    R, _ = _poses(tree, q)
+    R, _ = body_poses(tree, q)
     turn = [[R[a][b][tree.tip_body] for b in range(3)] for a in range(3)]
     angular, linear = (tuple(x[tree.tip_body] for x in of) for of in axes)
     linear = _plus(linear, _cross(angular, tuple(tree.tip_position)))
@@ -313,7 +326,7 @@ def _motion(tree: KinematicTree, q: AnyArray, dq: AnyArray, ddq: AnyArray, xp: M
 Pose = tuple[tuple[Vector, Vector, Vector], Vector]
 
 
-def _poses(tree: KinematicTree, q: Array) -> Pose:
+def body_poses(tree: KinematicTree, q: Array) -> Pose:
     """Of every body in the base: nine arrays (n_b, N) of rotations, three of positions."""
 
     def step(state: Pose, joint: _Joint) -> Pose:

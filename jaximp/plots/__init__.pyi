@@ -21,6 +21,7 @@ from .posterior import ellipse_bands as ellipse_bands
 from .posterior import torque_bands as torque_bands
 from .registry import figure_of as figure_of
 from .robot import parameters_against_urdf as parameters_against_urdf
+from .robot import robot as robot
 from .style import Panel as Panel
 from .style import curves as curves
 from .style import png as png

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from jaxtyping import Num
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaximp.identification.estimates import Estimates
+from jaximp.models import rigid_body
 from jaximp.models.chain import Chain
-from jaximp.plots.style import BLUE, ORANGE, PALE, WIDTH, Numbers, styled
+from jaximp.plots.style import BLACK, BLUE, GREEN, ORANGE, PALE, VERMILLION, WIDTH, Numbers, styled
 from jaximp.plots.wording import pretty_unit
 from jaximp.types import AnyArray
 
+POSES = 5
+"""Of a motion, that are drawn."""
 WIDE = 30.0
 """Where the largest value is so many times the usual one, an axis is logarithmic beyond the usual error."""
 KINDS = {
@@ -104,3 +110,45 @@ def _intervals(
     panel.axvline(0, color=PALE, linewidth=0.6)
     panel.set_yticks(place, [model.names[k] for k in which])
     panel.set_ylim(len(which) - 0.4, -0.6)
+
+
+@styled
+def robot(model: Chain, q: Num[AnyArray, "*N n"] | None = None) -> Figure:
+    """A robot's joints and how its links join them, from the side and from above.
+
+    **Arguments:** `q` (n,) the position to draw [rad or m], all zero by default; or a motion (N, n), of which the path
+    of the tip and five positions are drawn, the first of them dark.
+    """
+    motion = np.atleast_2d(np.zeros(model.n_joints) if q is None else np.asarray(q, float))
+    if model.n_joints == 1 and motion.shape[0] == 1:
+        motion = motion.T
+    shown = np.unique(np.linspace(0, len(motion) - 1, POSES).astype(int))
+    origins = np.asarray(rigid_body.body_frames(model.tree, motion)[1])
+    path = None if model.tip is None else np.asarray(model.forward_kinematics(motion)[1])
+    figure = Figure(figsize=(WIDTH, 0.62 * WIDTH))
+    views = figure.subplots(1, 2)
+    for panel, up, title in zip(views, (2, 1), ("from the side", "from above"), strict=True):
+        for k in shown[::-1]:
+            _skeleton(panel, model, origins[k], None if path is None else path[k], up, faded=bool(k != shown[0]))
+        if path is not None and len(path) > 1:
+            panel.plot(path[:, 0], path[:, up], color=GREEN, linewidth=0.8, label="path of the tip")
+        panel.set(xlabel="x (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal")
+        panel.margins(0.1)
+        panel.set_title(title, loc="left")
+    figure.legend(*views[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def _skeleton(panel: Axes, model: Chain, origins: Numbers, tip: Numbers | None, up: int, faded: bool) -> None:
+    """Lines from each joint to those that it bears, in the plane of x and one other axis."""
+    look: Any = {"color": PALE if faded else BLACK, "alpha": 0.4 if faded else 1.0, "linewidth": 1.0 if faded else 2.0}
+    for k, parent in enumerate(model.tree.parents):
+        start = np.zeros(3) if parent < 0 else origins[parent]
+        panel.plot([start[0], origins[k][0]], [start[up], origins[k][up]], **look)
+    if tip is not None:
+        start = np.zeros(3) if model.tree.tip_body < 0 else origins[model.tree.tip_body]
+        panel.plot([start[0], tip[0]], [start[up], tip[up]], **look)
+        if not faded:
+            panel.plot(tip[0], tip[up], "s", color=VERMILLION, label="tip")
+    if not faded:
+        panel.plot(origins[:, 0], origins[:, up], "o", color=BLUE, label="joint")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from factories.estimates import identified, repeat, without_trust
 from jaximp import plots
 from jaximp.identification.estimates import Estimates
-from jaximp.models import ArmGeometry, EndpointImpedance, endpoint_impedance
+from jaximp.models import SIX_JOINT_ARM, ArmGeometry, Chain, EndpointImpedance, endpoint_impedance
 from jaximp.plots.style import POINTS, draw_line
 from jaximp.trust.verdicts import TRUSTED
 
@@ -154,3 +154,15 @@ def test_ellipses_stand_at_the_hand_with_scale_bars() -> None:
     np.testing.assert_allclose(known, np.broadcast_to(geometry.forward(q), (8, 2)), atol=1e-9)
     nothing = EndpointImpedance(*(jnp.full((2, 2), jnp.nan),) * 3)
     assert plots.png(plots.ellipses(geometry, q, {"nothing": nothing}))
+
+
+def test_a_robot_is_drawn_where_its_joints_are() -> None:
+    arm = Chain.from_urdf(SIX_JOINT_ARM, tip="tool")
+    motion = np.linspace(0, 1, 30)[:, None] * np.array([0.3, 0.5, 0.7, 0.1, 0.2, 0.4])
+    for q in (None, motion[-1], motion):
+        figure = plots.robot(arm, q)
+        assert plots.png(figure).startswith(b"\x89PNG")
+        tip = next(line for line in figure.axes[0].get_lines() if line.get_label() == "tip")
+        expected = arm.forward_kinematics(np.zeros(6) if q is None else np.atleast_2d(q)[0])[1]
+        np.testing.assert_allclose(np.ravel(tip.get_data()), np.asarray(expected)[[0, 2]], atol=1e-12)
+    assert "path of the tip" in words_on(figure)
