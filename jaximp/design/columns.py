@@ -13,7 +13,7 @@ from jaximp.models import rigid_body
 from jaximp.models.base import Model, Role
 from jaximp.models.chain import Chain
 from jaximp.models.spatial import PARAMETERS
-from jaximp.types import nearest
+from jaximp.types import AnyArray, nearest
 
 
 class Selected(Model):
@@ -78,11 +78,13 @@ class Load(Model):
     """
 
     robot: Chain
+    in_link: Float[AnyArray, "10 10"]
+    """`Chain.load_in_link`."""
 
     def __init__(self, robot: Chain):
         if robot.tip is None or robot.tree.tip_body < 0:
             raise ValueError(f"{robot.robot} has no moving tip that bears a load: pass tip= with one of its links")
-        self.robot, self.n_joints, self.label = robot, robot.n_joints, "load"
+        self.robot, self.n_joints, self.label, self.in_link = robot, robot.n_joints, "load", robot.load_in_link
         self.names, self.units = tuple(f"load.{name}" for name in PARAMETERS), tuple(PARAMETERS.values())
         self.columns = tuple(f"{name} at {robot.tip} of {robot.robot}" for name in PARAMETERS)
 
@@ -102,7 +104,7 @@ class Load(Model):
         else:
             of_link = rigid_body.over_samples(_link_lanes, 1, self.robot.tree, *(x[..., None] for x in motion))
             of_link = of_link[..., 0, :]
-        return of_link @ self.robot.load_in_link
+        return of_link @ self.in_link
 
 
 def _link_lanes(tree: rigid_body.KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:
