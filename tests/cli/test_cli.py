@@ -136,7 +136,7 @@ def test_every_paper_can_be_reproduced() -> None:
     assert there == {paper.value for paper in Paper} == {"tout2023", "lakatos2011", "borner2020"}
 
 
-COMMANDS = ["demo", "check", "identify", "posterior", "design", "simulate", "batch", "reproduce"]
+COMMANDS = ["demo", "check", "identify", "posterior", "design", "export", "simulate", "batch", "reproduce"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -146,7 +146,7 @@ def test_help_teaches(run, command: str) -> None:  # type: ignore[no-untyped-def
     assert "Usage" in said
     assert len(said) > 300
     assert run(command, "-h")[:2] == (0, said)
-    if command != "check":
+    if command not in ("check", "export"):
         assert re.search(r"--out +-o ", said)
 
 
