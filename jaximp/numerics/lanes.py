@@ -224,20 +224,17 @@ def _upper_bound(diagonal: Array, squares: Array) -> Array:
 def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
     """Largest eigenvalue of a tridiagonal matrix: Laguerre's iteration falls to it from above and never passes it.
 
-    A lane that has converged stays as it is while others go on.
+    A step of the size of rounding is not taken: a lane that has converged stays as it is while others go on.
     """
     p = len(diagonal)
     small = 4 * jnp.finfo(diagonal.dtype).eps
 
-    def moving(value: Array, step: Array) -> Array:
-        return step > small * jnp.abs(value)
-
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        value, step, count = state
-        return moving(value, step).any() & (count < MOST_ITERATIONS)
+        _, step, count = state
+        return (step > 0).any() & (count < MOST_ITERATIONS)
 
     def improve(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        value, before, count = state
+        value, _, count = state
         first = second = slope = curve = coupling = jnp.zeros_like(value)
         above = jnp.ones(value.shape, bool)
         for i in range(p):
@@ -249,7 +246,8 @@ def _largest_root(diagonal: Array, squares: Array, start: Array) -> Array:
             coupling = squares[i] * over
             first, second = first + slope, second + slope**2 - curve
         root = jnp.sqrt(jnp.maximum((p - 1) * (p * second - first**2), 0))
-        step = jnp.where(above & moving(value, before), p / (first + root), 0)
+        step = p / (first + root)
+        step = jnp.where(above & (step > small * jnp.abs(value)), step, 0)
         return keep((value - step, step, count + 1))
 
     return lax.while_loop(unfinished, improve, (start, jnp.full_like(start, jnp.inf), jnp.zeros((), int)))[0]
