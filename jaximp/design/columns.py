@@ -99,12 +99,7 @@ class Load(Model):
         self, q: Num[ArrayLike, "..."], dq: Num[ArrayLike, "..."], ddq: Num[ArrayLike, "..."]
     ) -> Float[Array, "... p"]:
         motion = self._checked(q, dq, ddq)
-        if self.n_joints > 1:
-            of_link = rigid_body.over_samples(_link_lanes, self.n_joints, self.robot.tree, *motion)
-        else:
-            of_link = rigid_body.over_samples(_link_lanes, 1, self.robot.tree, *(x[..., None] for x in motion))
-            of_link = of_link[..., 0, :]
-        return of_link @ self.in_link
+        return rigid_body.rows_of_model(_link_lanes, self.n_joints, self.robot.tree, *motion) @ self.in_link
 
 
 def _link_lanes(tree: rigid_body.KinematicTree, q: Array, dq: Array, ddq: Array) -> Array:

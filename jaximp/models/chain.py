@@ -350,10 +350,7 @@ class Chain(Model):
         self, q: Num[ArrayLike, "..."], dq: Num[ArrayLike, "..."], ddq: Num[ArrayLike, "..."]
     ) -> Float[Array, "... p"]:
         """The base columns alone; shapes and errors as for every `Model`."""
-        motion = self._checked(q, dq, ddq)
-        if self.n_joints > 1:
-            return rigid_body.over_samples(_lanes, self.n_joints, self, *motion)
-        return rigid_body.over_samples(_lanes, 1, self, *(x[..., None] for x in motion))[..., 0, :]
+        return rigid_body.rows_of_model(_lanes, self.n_joints, self, *self._checked(q, dq, ddq))
 
     def torque(
         self,

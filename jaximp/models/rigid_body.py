@@ -378,6 +378,13 @@ def over_samples(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[Arr
     return jax.tree.map(lambda x: x.reshape(*shape[:-1], *x.shape[1:]), found)
 
 
+def rows_of_model(lanes: Callable[..., Any], n: int, parts: Any, *motion: Num[ArrayLike, "..."]) -> Any:
+    """`over_samples` of a regressor (n, p, N), for the motion of a `Model`: one joint has no axis of joints."""
+    if n > 1:
+        return over_samples(lanes, n, parts, *motion)
+    return over_samples(lanes, 1, parts, *(jnp.asarray(x)[..., None] for x in motion))[..., 0, :]
+
+
 @partial(compiled, static_argnums=0)
 def _in_blocks(lanes: Callable[..., Any], parts: Any, rows: list[Array]) -> Any:
     """Of motions (N, n), in their precision."""

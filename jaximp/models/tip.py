@@ -121,10 +121,7 @@ class TipImpedance(Model):
         self, q: Num[ArrayLike, "..."], dq: Num[ArrayLike, "..."], ddq: Num[ArrayLike, "..."]
     ) -> Float[Array, "... p"]:
         """As for every `Model`."""
-        motion = self._checked(q, dq, ddq)
-        if self.n_joints > 1:
-            return rigid_body.over_samples(_lanes, self.n_joints, self, *motion)
-        return rigid_body.over_samples(_lanes, 1, self, *(x[..., None] for x in motion))[..., 0, :]
+        return rigid_body.rows_of_model(_lanes, self.n_joints, self, *self._checked(q, dq, ddq))
 
 
 def _lanes(model: TipImpedance, q: Array, dq: Array, ddq: Array) -> Array:
