@@ -171,28 +171,11 @@ class Model(eqx.Module):
         return tuple(f"{self.label}.{name}" if self.label else name for name in self.names)
 
 
-class Stacked(Model):
-    """Two models that share the motion and add their torques: Tout et al. 2023, eq. (10)."""
+class _Pair(Model):
+    """Two models that share the motion; the first says how fast what makes the friction moves."""
 
     first: Model
     second: Model
-
-    def __init__(self, first: Model, second: Model):
-        _check_joints(first, second)
-        self.first, self.second = first, second
-        self.names = first._prefixed() + second._prefixed()
-        if len(set(self.names)) < len(self.names):
-            raise ValueError(
-                f"both models are called '{first.label}': stack two different things, such as robot + human"
-            )
-        self.units = first.units + second.units
-        self.columns = first.columns + second.columns
-        self.label = ""
-        self.n_joints = first.n_joints
-
-    @property
-    def roles(self) -> tuple[Role, ...]:
-        return self.first.roles + self.second.roles
 
     @property
     def regroups(self) -> bool:
@@ -219,6 +202,27 @@ class Stacked(Model):
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
         return _pair(self, lambda model: model.smoothed(width))
 
+
+class Stacked(_Pair):
+    """Two models that share the motion and add their torques: Tout et al. 2023, eq. (10)."""
+
+    def __init__(self, first: Model, second: Model):
+        _check_joints(first, second)
+        self.first, self.second = first, second
+        self.names = first._prefixed() + second._prefixed()
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(
+                f"both models are called '{first.label}': stack two different things, such as robot + human"
+            )
+        self.units = first.units + second.units
+        self.columns = first.columns + second.columns
+        self.label = ""
+        self.n_joints = first.n_joints
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        return self.first.roles + self.second.roles
+
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         return jnp.concatenate([self.first.row(q, dq, ddq), self.second.row(q, dq, ddq)], axis=-1)
 
@@ -229,7 +233,7 @@ class Stacked(Model):
         return jnp.concatenate(both, axis=-1)
 
 
-class Combined(Model):
+class Combined(_Pair):
     """Two models whose equal columns are merged, so that all parameters can be told apart: eq. (11).
 
     `merge` (p, p_first + p_second) maps the parameters of both onto the merged ones,
@@ -237,8 +241,6 @@ class Combined(Model):
     sums of several: these are told by random motions, and `sums` says what each parameter then stands for.
     """
 
-    first: Model
-    second: Model
     merge: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     _sums: tuple[tuple[str, str], ...] = eqx.field(static=True)
     _places: tuple[int, ...] = eqx.field(static=True)
@@ -273,31 +275,6 @@ class Combined(Model):
         """Of merged parameters that of the first."""
         both = self.first.roles + self.second.roles
         return tuple(both[place] for place in self._places)
-
-    @property
-    def regroups(self) -> bool:
-        return self.first.regroups or self.second.regroups
-
-    @property
-    def min_velocity(self) -> Any:
-        return jnp.maximum(self.first.min_velocity, self.second.min_velocity)
-
-    def speed(self, dq: Num[ArrayLike, "*N n"]) -> Float[Array, "*N n"]:
-        return self.first.speed(dq)
-
-    @property
-    def memory(self) -> int:
-        return max(self.first.memory, self.second.memory)
-
-    @property
-    def sample_rate(self) -> float | None:
-        return _shared_rate(self.first, self.second)
-
-    def sampled_at(self, sample_rate: float) -> Model:
-        return _pair(self, lambda model: model.sampled_at(sample_rate))
-
-    def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:
-        return _pair(self, lambda model: model.smoothed(width))
 
     def row(self, q: Array, dq: Array, ddq: Array) -> Array:
         return self._kept(Stacked(self.first, self.second).row(q, dq, ddq))
