@@ -20,8 +20,8 @@ from .posterior import corner as corner
 from .posterior import ellipse_bands as ellipse_bands
 from .posterior import torque_bands as torque_bands
 from .registry import figure_of as figure_of
-from .robot import parameters_against_urdf as parameters_against_urdf
-from .robot import robot as robot
+from .robots import parameters_against_urdf as parameters_against_urdf
+from .robots import robot as robot
 from .style import Panel as Panel
 from .style import curves as curves
 from .style import png as png

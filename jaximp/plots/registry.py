@@ -17,7 +17,7 @@ from jaximp.plots.estimates import parameters_over_time
 from jaximp.plots.excitation import design
 from jaximp.plots.impedance import impedance_methods
 from jaximp.plots.posterior import bands, corner
-from jaximp.plots.robot import parameters_against_urdf
+from jaximp.plots.robots import parameters_against_urdf
 from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.draws import Posterior
 from jaximp.posterior.inference import Inference
