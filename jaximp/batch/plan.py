@@ -120,7 +120,9 @@ class Plan:
         lines += [f"refused: {item.name}: {item.refused}" for item in refused[:MOST_NAMED]]
         lines += [f"refused: {len(refused) - MOST_NAMED} others"] if len(refused) > MOST_NAMED else []
         model = job.model
-        which = [name for name in ("robot", "human", "arm", "chain") if getattr(model, name) is not None]
+        named = {"robot": model.robot, "human": model.human, "arm": model.arm}
+        which = [name for name, settings in named.items() if settings is not None]
+        which += [] if model.chain is None else [f"robot of {model.chain.urdf}"]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
         every = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
         windows = "each recording as one window" if math.isinf(job.window.length) else every
@@ -329,6 +331,10 @@ def why_alone(job: WindowJob) -> str:
         return "a human in a robot needs two recordings at a time"
     if job.model.human is not None and job.model.human.reflex:
         return "a reflex remembers the past, and its gain is a fit of its own"
+    if job.model.chain is not None:
+        return "the joints of a robot are weighed by what is left of each"
+    if job.held_out is not None:
+        return "each predicts what is held out"
     return ""
 
 

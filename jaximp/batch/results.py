@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jaximp.batch.plan import Batch, Item, printable
-from jaximp.batch.tables import recordings_table, windows_table
+from jaximp.batch.tables import recordings_table, tells_residuals, windows_table
 from jaximp.batch.task import FAILED, About, Result, Task, checksum, file_checksum, input_checksum, job_checksum, load
 from jaximp.identification.identify import in_windows, solve_windows
 from jaximp.identification.prepared import Prepared, prepare, share_of_stack, without_unknown_delay
@@ -59,7 +59,7 @@ def solve_batch(task: Task, batch: Batch, stopped: Callable[[], bool] = lambda: 
         if result.stacked is None and result.recording is not None:
             _solve_alone(task, result)
             unwritten |= _write_reports(task, [result])
-            result.recording = None  # what is identified by itself may be long
+            result.recording = result.held_out = None  # what is identified by itself may be long
         results.append(result)
         if stopped():
             raise Interrupted
@@ -147,7 +147,8 @@ def _read(task: Task, batch: Batch, item: Item) -> Result:
     result = Result(item, sha256=input_checksum(item), reason=item.refused)
     if not result.reason:
         with _reasons(result):
-            recording = load(task.job.recording, item.file, task.job.folder)
+            whole = load(task.job.recording, item.file, task.job.folder)
+            recording, result.held_out = task.job.without_held_out(whole), task.job.load_held_out(whole)
             if recording.n_joints != task.joints:
                 raise ValueError(
                     f"{item.file}: it has {recording.n_joints} joints, but this study {task.joints}: name the columns "
@@ -194,8 +195,8 @@ def _solve_alone(task: Task, result: Result) -> None:
     if result.recording is not None and not result.reason:
         with _reasons(result), _one_at_a_time:
             pipeline = task.job.pipeline_for(result.recording)
-            prepared = prepare(pipeline, result.recording, _alone(task, result.item))
-            result.estimates = in_windows(prepared, curves=False)
+            prepared = prepare(pipeline, result.recording, _alone(task, result.item), result.held_out)
+            result.estimates = in_windows(prepared, curves=tells_residuals(task.job))
     result.seconds += time.perf_counter() - begin
 
 
@@ -314,7 +315,7 @@ def _write_reports(task: Task, results: Sequence[Result]) -> dict[str, str]:
             continue
         trusted = result.estimates[0].verdicts.trusted
         if report_wanted(task, result.item.name, len(trusted), int(trusted.sum())):
-            why = _write_report(task, result.item, result.recording)
+            why = _write_report(task, result.item, result.recording, result.held_out)
             unwritten |= {result.item.name: why} if why else {}
     return unwritten
 
@@ -323,11 +324,12 @@ def write_late_report(task: Task, item: Item) -> str:
     """The report of a recording that was identified before, and nothing; or why there is none."""
     found = Result(item)
     with _reasons(found):
-        found.recording = load(task.job.recording, item.file, task.job.folder)
-    return found.reason if found.recording is None else _write_report(task, item, found.recording)
+        whole = load(task.job.recording, item.file, task.job.folder)
+        found.held_out, found.recording = task.job.load_held_out(whole), task.job.without_held_out(whole)
+    return found.reason if found.recording is None else _write_report(task, item, found.recording, found.held_out)
 
 
-def _write_report(task: Task, item: Item, recording: Recording) -> str:
+def _write_report(task: Task, item: Item, recording: Recording, held_out: Recording | None) -> str:
     """Nothing, or why it could not be written: a report that fails must not cost a batch."""
     found = Result(item)
     with _one_at_a_time, _reasons(found):
@@ -335,17 +337,19 @@ def _write_report(task: Task, item: Item, recording: Recording) -> str:
         lines = [printable(f"# {name}: {' '.join(value.split())}\n") for name, value in about.items()]
         job = replace(task.job, text="".join(lines) + task.job.text)
         named = replace(recording, name=item.name)
-        write_report_of(job, named, _alone(task, item), report_folder(task.out, item.name))
+        write_report_of(job, named, _alone(task, item), report_folder(task.out, item.name), held_out)
     return found.reason
 
 
-def write_report_of(job: WindowJob, recording: Recording, alone: RobotAlone, folder: Path) -> None:
+def write_report_of(
+    job: WindowJob, recording: Recording, alone: RobotAlone, folder: Path, held_out: Recording | None = None
+) -> None:
     """What `identify` writes, for one recording."""
     from jaximp.identification.identify import at_other_lengths, longest_of
     from jaximp.recordings.outputs import new_folder
     from jaximp.reports.estimates import write_results
 
-    prepared = prepare(job.pipeline_for(recording), recording, alone)
+    prepared = prepare(job.pipeline_for(recording), recording, alone, held_out)
     estimates = in_windows(prepared, longest=longest_of(prepared))
     others = at_other_lengths(prepared, alone)
     with new_folder(folder, force=True) as draft:

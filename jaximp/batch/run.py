@@ -371,7 +371,10 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
     odd = _odd(table, [name for name in parameters if name.endswith(SCALED)])
     names, reasons = table["recording"].to_pylist(), table["reason"].to_pylist()
     table = _with_texts(table, "reason", [odd.get(name, why) for name, why in zip(names, reasons, strict=True)])
-    details = {f"{name}{end}" for name in parameters for end in ("_median_stderr", "_half_width_95")}
+    # One window has no spread, and nothing over time: its interval is told instead.
+    several = any(windows > 1 for windows in table["windows"].to_pylist())
+    left_out = ("_median_stderr", "_half_width_95" if several else "_sd")
+    details = {f"{name}{end}" for name in parameters for end in left_out}
     table = table.select([name for name in table.column_names if name not in {*HIDDEN, *details}])
     for name in metadata:
         table = _with_texts(table, name, [text or None for text in table[name].to_pylist()])
@@ -380,7 +383,7 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
         groups = []
     reports = {name: report_folder(out, name) / "report.html" for name in names}
     links = {name: file.relative_to(out).as_posix() for name, file in reports.items() if file.is_file()}
-    series = _series(out, main_parameter(parameters)) if parameters else {}
+    series = _series(out, main_parameter(parameters)) if parameters and several else {}
     unfinished = out / f".{PAGE}{UNFINISHED}"
     try:
         write_overview(unfinished, table, series, groups, links)

@@ -19,7 +19,7 @@ from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
-from jaximp.reports.estimates import estimates_table
+from jaximp.reports.estimates import estimates_table, sums_of
 from jaximp.reports.pages import table_of, versions
 from jaximp.trust.verdicts import VERDICTS
 
@@ -44,6 +44,7 @@ def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table
     about = results[0].about
     assert about is not None
     table = estimates_table(several, job)
+    about_table = table.schema.metadata
     table = table.rename_columns({"condition": "condition_number"})
     which = pa.array(np.repeat(np.arange(len(results)), [len(one.start) for one in several]))
     metadata = [dict(result.item.metadata) for result in results]
@@ -52,7 +53,7 @@ def windows_table(task: Task, results: Sequence[Result], k: int = 0) -> pa.Table
     for place, (name, texts) in enumerate(columns.items()):
         field = pa.field(name, pa.string(), metadata={"unit": ""})
         table = table.add_column(place, field, _texts(texts).take(which))
-    return table
+    return table.replace_schema_metadata(about_table)
 
 
 def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
@@ -77,6 +78,7 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     ]
     counts = [r.estimates[0].verdicts.counts() if r.estimates else dict.fromkeys(VERDICTS, 0) for r in results]
     columns += [(name, "1", np.array([count[name] for count in counts])) for name in VERDICTS]
+    columns += _residuals(job, results)
     parameters = _over_trusted(results, len(named))
     for k, (name, unit) in enumerate(named):
         columns += [(f"{name}_{what}", unit, _numbers(found[:, k])) for what, found in parameters.items()]
@@ -90,7 +92,25 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
         ("job_sha256", "", _texts([job_checksum(job)] * len(results))),
         ("seconds", "s", np.array([r.seconds for r in results])),
     ]
-    return table_of(columns, job.text)
+    return table_of(columns, job.text, **sums_of(model))
+
+
+def tells_residuals(job: WindowJob) -> bool:
+    """Whether recordings have columns for what is left of their torques: of robots, and where something is held out."""
+    return job.model.chain is not None or job.held_out is not None
+
+
+def _residuals(job: WindowJob, results: Sequence[Result]) -> list[tuple[str, str, Any]]:
+    """What is left of the torque of all joints, as a share of it; and of that which was held out."""
+    if not tells_residuals(job):
+        return []
+    firsts = [result.estimates[0] if result.estimates else None for result in results]
+    columns = {"residual": [None if one is None else one.residuals for one in firsts]}
+    if job.held_out is not None:
+        columns["held_out_residual"] = [None if one is None else one.held_out for one in firsts]
+    return [
+        (name, "1", _numbers(None if one is None else one.total for one in found)) for name, found in columns.items()
+    ]
 
 
 def _over_trusted(results: Sequence[Result], p: int) -> dict[str, NDArray[np.float64]]:

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from jaximp.identification.rows import Measured
 from jaximp.jobs.job import WindowJob
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.load import recording_from_mapping
+from jaximp.recordings.mapping import columns_of
 from jaximp.recordings.readers.formats import MATRICES, count_samples
 from jaximp.reports.pages import versions
 from jaximp.types import Recording
@@ -40,6 +41,7 @@ class Task:
 
     @classmethod
     def of(cls, job: WindowJob, plan: Plan, out: Path, reports: str | tuple[str, ...] = "none") -> Task:
+        job = replace(job, folder=Path(os.path.abspath(job.folder)))  # workers may start elsewhere
         return cls(job, out, plan.metadata, plan.partitions, plan.sizes, joints_of(job, plan.items), reports)
 
     def key(self, batch: Batch) -> str:
@@ -77,6 +79,8 @@ class Result:
     estimates: list[Estimates] = field(default_factory=list)
     """One for each method; none where it failed."""
     recording: Recording | None = None
+    held_out: Recording | None = None
+    """What the estimates of the recording are to predict, where the job says so."""
     about: About | None = None
     """What remains of the recording."""
     stacked: tuple[Any, Measured] | None = None
@@ -111,11 +115,11 @@ def file_checksum(path: Path | None) -> str:
 
 
 def job_checksum(job: WindowJob) -> str:
-    """Of the job file, and of the design and the robot's recording that it names."""
-    design = "" if job.design is None else file_checksum((job.folder / job.design).resolve())
-    robots = [(table or {}).get("file") for table in (job.robot_recording, job.robot_recording_after)]
-    alone = ["" if robot is None else file_checksum((job.folder / str(robot)).resolve()) for robot in robots]
-    return checksum("\n".join([job.text, design, *alone]).encode())
+    """Of the job file, and of all that it names beside its recording: the design, recordings of the robot, the URDF,
+    and what is held out."""
+    others = replace(job, recording={}, more_recordings=()).files()
+    found = [file_checksum(path.resolve()) for path in others]
+    return checksum("\n".join([job.text, *found]).encode())
 
 
 def input_checksum(item: Item) -> str:
@@ -150,6 +154,4 @@ def joints_of(job: WindowJob, items: Sequence[Item]) -> int:
 
 
 def named_joints(job: WindowJob) -> int:
-    position = job.recording.get("position")
-    position = position.get("column") if isinstance(position, Mapping) else position
-    return 1 if isinstance(position, str) else len(position or "1")
+    return len(columns_of(job.recording.get("position"))) or 1

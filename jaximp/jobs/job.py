@@ -169,15 +169,20 @@ class WindowJob:
 
         **Raises:** as `load_recording`.
         """
-        whole = self._joined([self.recording, *self.more_recordings])
+        return self.without_held_out(self._joined([self.recording, *self.more_recordings]))
+
+    def without_held_out(self, whole: Recording) -> Recording:
+        """What is identified of a recording, where its end is held out."""
         return part_of(whole, 0.0, 1 - self.held_out) if isinstance(self.held_out, float) else whole
 
-    def load_held_out(self) -> Recording | None:
-        """The recording that is to be predicted, where the job has one."""
+    def load_held_out(self, whole: Recording | None = None) -> Recording | None:
+        """The recording that is to be predicted, where the job has one; or the end of `whole`, by default of the job's
+        own recording."""
         if self.held_out is None:
             return None
         if isinstance(self.held_out, float):
-            return part_of(self._joined([self.recording, *self.more_recordings]), 1 - self.held_out, 1.0)
+            whole = self._joined([self.recording, *self.more_recordings]) if whole is None else whole
+            return part_of(whole, 1 - self.held_out, 1.0)
         columns = {key: value for key, value in self.recording.items() if key not in ("file", "rows", "name")}
         return self._joined([{**columns, **self.held_out}])
 

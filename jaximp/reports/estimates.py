@@ -511,8 +511,12 @@ def estimates_table(estimates: Estimates | Sequence[Estimates], job: WindowJob |
         (same[0].name, same[0].unit, np.concatenate([np.asarray(column.values) for column in same]))
         for same in zip(*(one.columns() for one in several), strict=True)
     ]
-    sums = {"sums": json.dumps(model.sums)} if isinstance(model := several[0].model, Chain) else {}
-    return table_of(columns, "" if job is None else job.text, **sums)
+    return table_of(columns, "" if job is None else job.text, **sums_of(several[0].model))
+
+
+def sums_of(model: Model | None) -> dict[str, str]:
+    """What a table's metadata say of a robot from its URDF: what each of its parameters stands for, as JSON."""
+    return {"sums": json.dumps(model.sums)} if isinstance(model, Chain) else {}
 
 
 def _result(estimates: Estimates) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -11,14 +12,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from browser import browser, executable
+from factories.chains import TWO_JOINTS, arrays, chain_in
 from factories.studies import JOB, LENGTHS, beside, joint, still
 from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
 from jaximp.batch import tables as batch_tables
 from jaximp.batch.plan import find_items, make_plan
-from jaximp.jobs.job import parse_job, read_job
-from jaximp.jobs.run import identify_recording
+from jaximp.batch.task import Task
+from jaximp.jobs.job import WindowJob, parse_job, read_job
+from jaximp.jobs.run import identify, identify_recording
 from jaximp.least_squares import sliding as windows
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.recordings.save import save_recording
@@ -260,3 +263,54 @@ def test_columns_may_have_the_endings_of_results(study: Path, tmp_path: Path) ->
     page = (tmp_path / "out" / "overview.html").read_text()
     assert "emg_mean" in page
     assert "x_median_stderr" in page
+
+
+ROBOT = """
+held_out = 0.25
+[recording]
+file = "a.csv"
+time = 1
+position = { columns = [2, 3], unit = "rad" }
+torque = [4, 5]
+[model.robot]
+urdf = "two_joints.urdf"
+friction = true
+[filter]
+position_cutoff = 8.0
+decimation_cutoff = 4.0
+"""
+
+
+def test_robots_from_a_urdf_are_a_study(tmp_path: Path) -> None:
+    """Each is what `identify` finds of its file: with joints that are weighed, and an end that is held out."""
+    chain = chain_in(tmp_path)
+    for seed, name in enumerate(("a.csv", "b.csv")):
+        np.savetxt(tmp_path / name, np.column_stack(arrays(chain, seed)), delimiter=",", fmt="%.9g")
+    (tmp_path / "study.csv").write_text("file,condition\na.csv,cold\nb.csv,warm\n")
+    job, out = parse_job(ROBOT, tmp_path), tmp_path / "out"
+    assert isinstance(job, WindowJob)
+    plan = make_plan(job, find_items([], tmp_path / "study.csv"))
+    assert {"model: robot of two_joints.urdf; each recording as one window"} < set(plan.in_words(job))
+    assert plan.one_by_one == "the joints of a robot are weighed by what is left of each"
+    outcome = batch.run_plan(job, plan, out)
+    assert (outcome.failed, outcome.windows, outcome.trusted) == ([], 2, 2)
+    recordings = batch.read_recordings(out)
+    for k, name in enumerate(("a", "b")):
+        expected = identify(parse_job(ROBOT.replace("a.csv", f"{name}.csv"), tmp_path))[0]
+        (path,) = (out / "estimates" / f"condition-{('cold', 'warm')[k]}").glob("*.parquet")
+        found, low_high = pq.ParquetFile(path).read(), expected.interval()
+        assert json.loads(found.schema.metadata[b"sums"]) == chain.sums
+        for column, parameter in enumerate(chain.names):
+            assert found[parameter][0].as_py() == np.asarray(expected.fit.theta)[0, column]
+            assert found[f"{parameter}_stderr"][0].as_py() == np.asarray(expected.fit.stderr)[0, column]
+            half = recordings[f"{parameter}_half_width_95"][k].as_py()
+            np.testing.assert_allclose(2 * half, (low_high[1] - low_high[0])[0, column], 1e-9)
+        for name_of, residuals in (("residual", expected.residuals), ("held_out_residual", expected.held_out)):
+            assert recordings[name_of][k].as_py() == residuals.total
+    page = (out / "overview.html").read_text()
+    assert "link2.mc_z_half_width_95" in page
+    assert "link2.mc_z_sd" not in page
+    task = Task.of(job, plan, out)
+    assert batch_results.finished(task, plan.batches[0]) is not None
+    (tmp_path / "two_joints.urdf").write_text(TWO_JOINTS + "\n")
+    assert batch_results.finished(task, plan.batches[0]) is None

@@ -38,7 +38,7 @@ def test_reports_are_those_that_were_asked_for(
 ) -> None:
     """A recording has failed if none of its windows can be trusted."""
     written: list[str] = []
-    monkeypatch.setattr(batch_results, "write_report_of", lambda job, one, alone, folder: written.append(one.name))
+    monkeypatch.setattr(batch_results, "write_report_of", lambda job, one, *others: written.append(one.name))
     good = joint(1000)
     torque = np.random.default_rng(0).normal(size=(1000, 1))
     save_recording(good, tmp_path / "good.parquet")
@@ -50,7 +50,7 @@ def test_reports_are_those_that_were_asked_for(
 def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a recording by its name, though its batch is done; the overview links it. A changed recording loses it."""
 
-    def write(job: Job, one: Recording, alone: Recording | None, folder: Path) -> None:
+    def write(job: Job, one: Recording, alone: Recording | None, folder: Path, held_out: object) -> None:
         folder.mkdir(parents=True)
         (folder / "report.html").write_text(one.name)
 
@@ -76,7 +76,7 @@ def test_a_report_can_be_had_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_what_did_not_change_keeps_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Though it is done again with those beside it; and what another run leaves out is told."""
 
-    def write(job: Job, one: Recording, alone: Recording | None, folder: Path) -> None:
+    def write(job: Job, one: Recording, alone: Recording | None, folder: Path, held_out: object) -> None:
         folder.mkdir(parents=True)
         (folder / "report.html").write_text(f"{one.name} {job.text.splitlines()[0]}")
 
