@@ -132,6 +132,7 @@ KINDS = {
     str: "text",
     list[float]: "list of numbers",
     dict[str, float]: "table of numbers",
+    list[int]: "list of whole numbers",
     list[str]: "list of text",
     list[list[str]]: "list of lists of text",
     dict[str, list[float]]: "table of lists of numbers",

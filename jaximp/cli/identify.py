@@ -52,13 +52,11 @@ def identify_into(job: Job, folder: Path) -> None:
         estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), longest_of(prepared))
         others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
-        from jaximp.reports.payload import write_load
 
         lengths = [] if longest_of(prepared) is None else sorted([estimates[0], *others], key=lambda e: e.window)
-        write_results(folder, estimates, lengths, job, prepared.recording)
         found = weigh(job)
-        if found is not None:
-            write_load(folder, found)
+        progress(0.9)
+        write_results(folder, estimates, lengths, job, prepared.recording, found)
         progress(1.0)
     _say_result(estimates[0])
     for line in [] if found is None else found.in_words():

@@ -6,10 +6,10 @@ from jaximp.identification.check import Finding, Proposal, check_recording
 from jaximp.identification.drive_gains import DriveGains
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
-from jaximp.identification.payload import Payload
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.prepared import prepare as prepare_recording
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
+from jaximp.jobs.payload import Weighed
 from jaximp.jobs.run_trials import identify_trials, infer_trials
 from jaximp.perturbation.trials_result import TrialsResult
 from jaximp.posterior.arm import ArmInference
@@ -40,7 +40,7 @@ def identify_recording(
     return estimate(job.pipeline_for(recording), recording, alone, progress, held_out)
 
 
-def weigh(job: WindowJob) -> Payload | DriveGains | None:
+def weigh(job: WindowJob) -> Weighed | DriveGains | None:
     """What a job with `[payload]` asks for: the load, or by a known load the gains of the drives.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.

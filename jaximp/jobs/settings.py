@@ -68,6 +68,7 @@ def checked(value: Any, hint: Any, where: str) -> Any:
     expected: dict[Any, str | None] = {
         float: "a number",
         list[float]: "a list of numbers",
+        list[int]: "a list of whole numbers",
         list[str]: "a list of text",
         dict[str, float]: "a table of numbers",
         int: "a whole number",

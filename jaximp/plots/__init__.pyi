@@ -20,6 +20,7 @@ from .posterior import corner as corner
 from .posterior import ellipse_bands as ellipse_bands
 from .posterior import torque_bands as torque_bands
 from .registry import figure_of as figure_of
+from .robots import load_by_method as load_by_method
 from .robots import parameters_against_urdf as parameters_against_urdf
 from .robots import robot as robot
 from .style import Panel as Panel

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jaximp.design.excitation import Design
 from jaximp.identification.estimates import Estimates
+from jaximp.identification.payload import Payload
 from jaximp.models.chain import Chain
 from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.trials_result import TrialsResult
@@ -17,7 +18,7 @@ from jaximp.plots.estimates import parameters_over_time
 from jaximp.plots.excitation import design
 from jaximp.plots.impedance import impedance_methods
 from jaximp.plots.posterior import bands, corner
-from jaximp.plots.robots import parameters_against_urdf
+from jaximp.plots.robots import load_by_method, parameters_against_urdf
 from jaximp.posterior.arm import ArmInference
 from jaximp.posterior.draws import Posterior
 from jaximp.posterior.inference import Inference
@@ -37,6 +38,11 @@ def figure_of(result: Any) -> Figure:
 def _(result: Estimates) -> Figure:
     one_robot = isinstance(result.model, Chain) and len(result.end) == 1
     return parameters_against_urdf(result) if one_robot else parameters_over_time(result.summarised())
+
+
+@figure_of.register
+def _(result: Payload) -> Figure:
+    return load_by_method([result])
 
 
 @figure_of.register

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaximp.identification.estimates import Estimates
+from jaximp.identification.payload import Payload
 from jaximp.models import rigid_body
 from jaximp.models.chain import Chain
 from jaximp.plots.style import BLACK, BLUE, GREEN, ORANGE, PALE, VERMILLION, WIDTH, Numbers, styled
@@ -110,6 +112,28 @@ def _intervals(
     panel.axvline(0, color=PALE, linewidth=0.6)
     panel.set_yticks(place, [model.names[k] for k in which])
     panel.set_ylim(len(which) - 0.4, -0.6)
+
+
+@styled
+def load_by_method(loads: Sequence[Payload]) -> Figure:
+    """Mass and centre of mass of a load by several methods, with intervals of 95 %."""
+    figure = Figure(figsize=(WIDTH, 0.9 + 0.25 * len(loads)))
+    panels, place = figure.subplots(1, 4, sharey=True), np.arange(len(loads))
+    titles = ("mass (kg)", *(f"centre, {axis} (mm)" for axis in "xyz"))
+    for k, (panel, title) in enumerate(zip(panels, titles, strict=True)):
+        factor, found = (1.0, loads) if k == 0 else (1e3, [load.centre for load in loads])
+        which = max(k - 1, 0)
+        value = factor * np.array([one.theta[which] for one in found])
+        low, high = factor * np.array([[end[which] for end in one.interval()] for one in found]).T
+        panel.errorbar(
+            value, place, xerr=np.stack([value - low, high - value]), fmt="o", color=BLUE, capsize=2, markersize=3
+        )
+        panel.set_title(title, loc="left")
+        panel.margins(x=0.15)
+        panel.locator_params(axis="x", nbins=4)
+    panels[0].set_yticks(place, [f"method {load.method}" for load in loads])
+    panels[0].set_ylim(len(loads) - 0.4, -0.6)
+    return figure
 
 
 @styled

@@ -17,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp import plots
+from jaximp.identification.drive_gains import DriveGains
 from jaximp.identification.estimates import Estimates, HumanPart, Reflex
 from jaximp.identification.filter_settings import design_filters
 from jaximp.identification.residuals import Residuals
 from jaximp.identification.separation import METHODS
 from jaximp.identification.suspects import what
 from jaximp.jobs.job import WindowJob
+from jaximp.jobs.payload import Weighed
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
 from jaximp.models.chain import Chain
@@ -45,6 +47,7 @@ from jaximp.reports.pages import (
     write_page,
     write_table,
 )
+from jaximp.reports.payload import load_pictures, load_sections, write_load
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.score_tests import p_in_words
 from jaximp.trust.verdicts import FAKE, NO_DATA, POOR, TRUSTED, WEAK
@@ -156,21 +159,24 @@ def write_results(
     lengths: Sequence[Estimates],
     job: WindowJob,
     recording: Recording,
+    load: Weighed | DriveGains | None = None,
 ) -> None:
     """Write everything into an existing folder.
 
     `estimates.parquet` (and `estimates_method3.parquet` for a further method 3), `summary.json`, `report.html`, and
-    every figure of the report as a PNG file.
+    every figure of the report as a PNG file; of a load `payload.json`, of gains by a known load `gains.json`.
 
     **Arguments:** `estimates_list` one for each method, the main one first; `lengths` the same data at several window
-    lengths, or nothing.
+    lengths, or nothing; `load` what a job with `[payload]` found.
     """
     folder = Path(folder)
     for k, estimates in enumerate(estimates_list):
         name = "estimates" if k == 0 else f"estimates_method{estimates.method}"
         write_table(folder / f"{name}.parquet", estimates_table(estimates, job))
     content = summary(estimates_list, job, recording, lengths)
-    write_page(folder, page(estimates_list, lengths, content), content)
+    if load is not None:
+        write_load(folder, load)
+    write_page(folder, page(estimates_list, lengths, content, load), content)
 
 
 def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) -> dict[str, bytes]:
@@ -195,9 +201,15 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
     return {name: plots.png(figure) for name, figure in figures.items()}
 
 
-def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], content: dict[str, Any]) -> Page:
-    """The report on a `summary`."""
+def page(
+    estimates_list: Sequence[Estimates],
+    lengths: Sequence[Estimates],
+    content: dict[str, Any],
+    load: Weighed | DriveGains | None = None,
+) -> Page:
+    """The report on a `summary`, which begins with the load where there is one."""
     images, recording, windows = pictures(estimates_list, lengths), content["recording"], content["windows"]
+    heading = "" if load is None else "The robot with its load"
     main = main_parameter(estimates_list[0].names)
     below: dict[str, list[Part]] = {
         "by_frequency": [Prose(said) for said in map(frequencies_in_words, estimates_list[0].frequencies)],
@@ -212,7 +224,8 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
         f"{windows['count']} window{'s' * (windows['count'] != 1)} of {digits(content['window_s'])} s{method}",
         sections=[
-            Section("", [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
+            *load_sections(load),
+            Section(heading, [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
             _verdicts(estimates_list[0], content),
             *_tests(content),
             *_residuals(content),
@@ -220,7 +233,7 @@ def page(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates], cont
             *_robot_alone(content),
             *closing_sections("Sampling, filters and limits", _settings(content), content["job"]),
         ],
-        pictures=images,
+        pictures=images | load_pictures(load),
         live=live_figures(estimates_list[0]),
     )
 
