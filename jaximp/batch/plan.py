@@ -123,6 +123,7 @@ class Plan:
         named = {"robot": model.robot, "human": model.human, "arm": model.arm}
         which = [name for name, settings in named.items() if settings is not None]
         which += [] if model.chain is None else [f"robot of {model.chain.urdf}"]
+        which += [] if model.tip is None else ["human who holds its end"]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
         every = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
         windows = "each recording as one window" if math.isinf(job.window.length) else every

@@ -21,10 +21,11 @@ from jaximp.identification.misfit import find_human_misfits, find_misfits
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
 from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, prepare, whitener, with_windows
 from jaximp.identification.residuals import Residuals
-from jaximp.identification.robot_changes import Doubts, Sameness
+from jaximp.identification.robot_changes import OTHER_METHODS, Doubts, Sameness
 from jaximp.identification.rows import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
+from jaximp.identification.tip_pairs import TipPair, fit_tip
 from jaximp.identification.weighted import weighted_fit
 from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.identification.whole import of_whole_recording
@@ -170,6 +171,8 @@ def _usual(fit: SlidingFit) -> NDArray[np.float64] | None:
 
 def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Progress, curves: bool) -> list[Estimates]:
     """The human in the robot, by every method that is asked for."""
+    if pair.tip is not None:
+        return _by_methods_at_tip(prepared, pair, pair.tip, place, progress, curves)
     rows, methods = prepared.rows, prepared.pipeline.methods
     noise = None if prepared.pipeline.whitens else prepared.noise
     merge, same = combine(pair.robot, prepared.model).merge, robot_sameness(prepared, pair)
@@ -205,10 +208,32 @@ def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Prog
     return results
 
 
+def _by_methods_at_tip(
+    prepared: Prepared, pair: Pair, tip: TipPair, place: Placement, progress: Progress, curves: bool
+) -> list[Estimates]:
+    """The human at the end of the robot, by every method that is asked for. Errors hold those of the gains already."""
+    rows, methods, model, results = prepared.rows, prepared.pipeline.methods, prepared.model, []
+    own = replace(prepared, recording=replace(prepared.recording, gain_covariance=None))
+    both = combine(pair.robot, model) if 2 in methods else None
+    for count, method in enumerate(methods):
+        found = fit_tip(method, tip, both, place)
+        n = found.rows
+        human = Rows(tip.loaded.human[:n], jnp.asarray(found.torque), rows.valid[:n], rows.time[:n])
+        doubts = Doubts({model.names[k]: why for k, why in (found.doubts or {}).items()}, OTHER_METHODS)
+        solved, notes = _predict(human, found.fit, place), (METHODS[method], found.note, *pair.notes)
+        estimates = judge(own, human, solved, place, method, *notes, curves=curves, doubts=doubts)
+        may_change = np.sqrt(np.diagonal(pair.change))
+        of_robot = replace(estimates, robot=pair.robot_fit, robot_names=pair.robot.names, robot_change=may_change)
+        results.append(replace(of_robot, method=method))
+        progress((count + 1) / len(methods))
+    return results
+
+
 def robot_sameness(prepared: Prepared, pair: Pair) -> Sameness | None:
-    """What the robot's own parameters say of a change between the recordings; nothing without white rows."""
+    """What the robot's own parameters say of a change between the recordings; nothing without white rows, or where the
+    human holds the end of the robot."""
     whiten, loaded = whitener(prepared.pipeline), pair.loaded
-    if whiten is None:
+    if whiten is None or pair.tip is not None:
         return None
     torque = loaded.torque - loaded.robot @ pair.robot_fit.theta
     white = whiten(loaded.human, torque, loaded.valid, loaded.robot)

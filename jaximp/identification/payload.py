@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximp.identification.block_errors import SINGULAR, BlockFit, block_fit, of_each
+from jaximp.identification.additions import Separated, from_the_rest, gains_of, together
+from jaximp.identification.block_errors import SINGULAR, BlockFit, block_fit
 from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.prepared import without_unknown_delay
 from jaximp.identification.quantities import Quantities, freedom
@@ -178,7 +179,7 @@ def identify_payload(pipeline: Pipeline, alone: Several, loaded: Several, method
     elif method == 3:
         found = _same_motion(pipeline, ten, block_fit(empty), without, with_load)
     else:
-        found = _together(ten, empty, full)
+        found = together(empty, full, full.W @ ten.columns)[0]
     return _payload(chain, method, ten, found, gains, without, with_load)
 
 
@@ -233,19 +234,6 @@ def load_columns(chain: Chain) -> Numbers:
     return np.asarray(chain.base.map, float)[:, first : first + 10] @ chain.load_in_link
 
 
-def gains_of(several: Sequence[Recording]) -> Numbers | None:
-    """(n, n) covariance of the relative errors of the drives' gains.
-
-    **Raises:** `ValueError` where recordings state different ones.
-    """
-    stated = [one.gain_covariance for one in several]
-    first = stated[0]
-    for other in stated[1:]:
-        if (first is None) != (other is None) or (first is not None and not np.array_equal(first, np.asarray(other))):
-            raise ValueError("the recordings state different errors of the gains: they are those of the same drives")
-    return first
-
-
 class TenParameters(NamedTuple):
     """What the motion shows of a load's ten parameters: `load = back @ u`, of which `u` (d,) is seen in the torque."""
 
@@ -271,38 +259,11 @@ class TenParameters(NamedTuple):
 # --- four methods -----------------------------------------------------------------------------------------------------
 
 
-class _Found(NamedTuple):
-    """What a method says of `u`."""
-
-    u: Numbers
-    """(d,)"""
-    sources: tuple[tuple[Numbers, BlockFit], ...]
-    """The fits whose errors it has, each with rows (d, p): what the fit's parameters add to `u`."""
-    by_joint: Numbers
-    """(d, n) what the torques of each joint make of it by themselves; they add up to `u`."""
-    left: Numbers
-    """(n,)"""
-    notes: tuple[str, ...] = ()
+def _robot_first(ten: TenParameters, robot: BlockFit, full: Rows) -> Separated:
+    return from_the_rest(full.W @ ten.columns, full, full.W, robot)[0]
 
 
-def _robot_first(ten: TenParameters, robot: BlockFit, full: Rows) -> _Found:
-    return _from_the_rest(full.W @ ten.columns, full, full.W, robot)
-
-
-def _from_the_rest(load: Numbers, rows: Rows, robots: Numbers, robot: BlockFit, notes: tuple[str, ...] = ()) -> _Found:
-    """The load from what the robot's model leaves of a torque.
-
-    **Arguments:** columns of the `load` (S, n, d); `rows` whose torque is explained; columns of the robot (S, n, p).
-    """
-    torque = np.asarray(rows.torque)
-    fit = block_fit(Rows(load, torque - robots @ robot.theta, rows.valid, rows.time))
-    imitated = fit.solve(robots)
-    by_joint = fit.solve(of_each(torque)) - imitated @ robot.by_joint
-    sources = (np.eye(len(fit.theta)), fit), (-imitated, robot)
-    return _Found(fit.theta, sources, by_joint, fit.size, notes)
-
-
-def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: BlockFit, full: Rows) -> _Found:
+def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: BlockFit, full: Rows) -> Separated:
     """By the links' parameters alone: a load changes friction, too, and nobody knows how."""
     with_load = block_fit(full)
     links = np.array([not name.startswith("joint") or name.endswith("rotor_inertia") for name in chain.names])
@@ -312,12 +273,12 @@ def _difference_of_parameters(chain: Chain, ten: TenParameters, robot: BlockFit,
     G = np.zeros((ten.columns.shape[1], len(links)))
     G[:, links] = np.linalg.solve(columns.T @ weighted, weighted.T)
     by_joint = G @ (with_load.by_joint - robot.by_joint)
-    return _Found(G @ (with_load.theta - robot.theta), ((G, with_load), (-G, robot)), by_joint, with_load.size)
+    return Separated(G @ (with_load.theta - robot.theta), ((G, with_load), (-G, robot)), by_joint, with_load.size)
 
 
 def _same_motion(
     pipeline: Pipeline, ten: TenParameters, robot: BlockFit, without: list[Recording], with_load: list[Recording]
-) -> _Found:
+) -> Separated:
     if len(without) > 1 or len(with_load) > 1:
         raise ValueError("method 3 compares two recordings of one motion: give one without and one with the load")
     alone, loaded, apart = _aligned(without[0], with_load[0])
@@ -332,7 +293,7 @@ def _same_motion(
     note = f"by the robot's model the motions differ by {differs / own:.1%} of its torque, which was taken off"
     shift = f"{loaded.name} begins {apart:.3g} s later in the motion than {alone.name}" if apart else ""
     rows = Rows(full.W, np.asarray(full.torque) - np.asarray(empty.torque), valid, full.time)
-    return _from_the_rest(full.W @ ten.columns, rows, moved_by, robot, tuple(filter(None, [shift, note])))
+    return from_the_rest(full.W @ ten.columns, rows, moved_by, robot, tuple(filter(None, [shift, note])))[0]
 
 
 def _aligned(alone: Recording, loaded: Recording) -> tuple[Recording, Recording, float]:
@@ -354,19 +315,6 @@ def _aligned(alone: Recording, loaded: Recording) -> tuple[Recording, Recording,
     return first, second, shift / alone.sample_rate
 
 
-def _together(ten: TenParameters, empty: Rows, full: Rows) -> _Found:
-    none = np.zeros((*np.shape(empty.torque), ten.columns.shape[1]))
-    W = np.concatenate(
-        [np.concatenate([x.W, load], axis=-1) for x, load in ((empty, none), (full, full.W @ ten.columns))]
-    )
-    torque, valid, time = (
-        np.concatenate([getattr(x, key) for x in (empty, full)]) for key in ("torque", "valid", "time")
-    )
-    fit = block_fit(Rows(W, torque, valid, time))
-    of_load = np.eye(W.shape[-1])[empty.W.shape[-1] :]
-    return _Found(of_load @ fit.theta, ((of_load, fit),), of_load @ fit.by_joint, fit.size)
-
-
 def _rms(x: Numbers) -> float:
     return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
@@ -378,7 +326,7 @@ def _payload(
     chain: Chain,
     method: int,
     ten: TenParameters,
-    found: _Found,
+    found: Separated,
     gains: Numbers | None,
     without: list[Recording],
     with_load: list[Recording],

@@ -116,7 +116,8 @@ class Pipeline:
     @property
     def min_velocity(self) -> Numbers:
         """() or (n,): slower rows of a joint do not count [rad/s or m/s]."""
-        return np.asarray(np.maximum(self.window.min_velocity, self.model.min_velocity))
+        slowest = 0.0 if self.robot is None else self.robot.min_velocity
+        return np.asarray(np.maximum(np.maximum(self.window.min_velocity, self.model.min_velocity), slowest))
 
     @property
     def whole(self) -> bool:

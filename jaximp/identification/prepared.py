@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp.identification.additions import gains_of
 from jaximp.identification.corrections import noise_in_band
 from jaximp.identification.delays import find_delay
 from jaximp.identification.instruments import Drive, find_drives
@@ -28,6 +30,7 @@ from jaximp.identification.rows import Filtered, Measured, Rows, column_noise, m
 from jaximp.identification.separation import Regression, Whiten, fit_robot
 from jaximp.identification.solving import MOST_ROWS, Solved
 from jaximp.identification.stribeck import Curves, find_curves
+from jaximp.identification.tip_pairs import TipPair, robot_of, window_fit_of
 from jaximp.identification.weighted import by_size, sizes_of_joints
 from jaximp.identification.whitening import White, whiten
 from jaximp.least_squares.window import WindowFit
@@ -60,6 +63,8 @@ class Pair:
     """How far the robot may have changed, in words."""
     agree: float = 1.0
     """Probability of a difference as large as that of two recordings of the robot alone, if it did not change."""
+    tip: TipPair | None = None
+    """Where the human holds the end of a robot of several joints: rows and robot as these methods take them."""
 
 
 @dataclass(frozen=True)
@@ -239,13 +244,15 @@ def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tupl
     rows = regress(measured)[0] if pipeline.once else regress_in_windows(pipeline, recording, both)
     n = len(robot.names)
     W, torque = jnp.asarray(rows.W), jnp.asarray(rows.torque)
-    return Regression(W[:, :n], W[:, n:], torque, jnp.asarray(rows.valid)), rows, measured
+    return Regression(W[..., :n], W[..., n:], torque, jnp.asarray(rows.valid)), rows, measured
 
 
 def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, several: tuple[Recording, ...]) -> Prepared:
     """**Arguments:** `several` recordings of the robot alone: one, or one before and one after the human's."""
     pipeline.check(recording)
-    _check_pair(recording, several)
+    _check_pair(recording, several, isinstance(robot, Chain))
+    if isinstance(robot, Chain):
+        return _prepare_tip(pipeline, robot, recording, several)
     # The robot's own parameters come from its whole recordings, which need no windows.
     whole = [regress_pair(once(pipeline), robot, one)[0] for one in several]
     fits = [_fit_robot(pipeline, one) for one in whole]
@@ -257,6 +264,29 @@ def _prepare_pair(pipeline: Pipeline, robot: Model, recording: Recording, severa
     loaded, rows, measured = regress_pair(pipeline, robot, recording)
     noise = column_noise(measured) if rows.noisy is None else np.sqrt((rows.noisy**2).mean(axis=0))
     pair = _pair(pipeline, robot, fits, in_windows, loaded, tests)
+    return _prepared(measured, rows, noise[len(robot.names) :], pair)
+
+
+def _prepare_tip(pipeline: Pipeline, robot: Chain, recording: Recording, several: tuple[Recording, ...]) -> Prepared:
+    """Of a human at the end of a robot, whose joints are weighed by what is left of each."""
+    if robot.stribeck_unknown:
+        raise ValueError("Stribeck's curves are not looked for beside a human: identify the robot alone, and give them")
+    if not pipeline.ordinary:
+        raise ValueError(
+            "a human at the end of a robot is identified by ordinary least squares: leave out estimates and noise in "
+            "[window], and filter.mode"
+        )
+    gains = gains_of([*several, recording])
+    whole = [regress_pair(pipeline, robot, one)[0] for one in several]
+    loaded, rows, measured = regress_pair(pipeline, robot, recording)
+    of_each = [window_fit_of(robot_of(one)) for one in whole]
+    alone = jax.tree.map(lambda *parts: jnp.concatenate(parts), *whole)
+    pair = _pair(pipeline, robot, of_each, whole[0], loaded, None)
+    found = robot_of(alone)
+    tip = TipPair(alone, loaded, found, pair.change, gains, len(whole[0].torque))
+    assert rows.noisy is not None
+    noise = np.sqrt((rows.noisy.reshape(-1, rows.noisy.shape[-1]) ** 2).mean(axis=0))
+    pair = replace(pair, robot_fit=window_fit_of(found), tip=tip)
     return _prepared(measured, rows, noise[len(robot.names) :], pair)
 
 
@@ -290,12 +320,17 @@ def _pair(
     return Pair(robot, fit, change + drift, alone, loaded, tests, notes, p)
 
 
-def _check_pair(recording: Recording, several: tuple[Recording, ...]) -> None:
+def _check_pair(recording: Recording, several: tuple[Recording, ...], at_tip: bool) -> None:
     if not several:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
     for alone in several:
-        if recording.n_joints != 1 or alone.n_joints != 1:
+        if not at_tip and (recording.n_joints != 1 or alone.n_joints != 1):
             raise ValueError("methods 1 to 4 work on one joint at a time: map one position and one torque column")
+        if alone.joints != recording.joints:
+            raise ValueError(
+                f"the robot alone was recorded with {alone.n_joints} joints and with the human with "
+                f"{recording.n_joints}, or joints of another kind: map the same ones"
+            )
         if abs(alone.sample_rate - recording.sample_rate) > 1e-3 * recording.sample_rate:
             raise ValueError(
                 f"the robot alone was sampled at {alone.sample_rate:g} Hz and the robot with the human at "
@@ -321,7 +356,7 @@ def _prepared(measured: Measured, rows: Rows, noise: NDArray[np.float64], pair: 
     prepared = Prepared(
         recording, pipeline, rows, noise, pair, reference, measured.jumps, white, drives=drives, explained=explained
     )
-    return _weighted(prepared) if pipeline.weighs else prepared
+    return _weighted(prepared) if pipeline.weighs and pair is None else prepared
 
 
 def _weighted(prepared: Prepared) -> Prepared:

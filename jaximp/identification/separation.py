@@ -35,15 +35,15 @@ METHODS = {
 
 
 class Regression(eqx.Module):
-    """A filtered recording of one joint, ready for least squares."""
+    """A filtered recording, ready for least squares; n joints where a human holds the end of a robot of so many."""
 
-    robot: Float[Array, "N r"]
+    robot: Float[Array, "N *n r"]
     """Rows of the robot's model."""
-    human: Float[Array, "N h"]
+    human: Float[Array, "N *n h"]
     """Rows of the human's model."""
-    torque: Float[Array, " N"]
+    torque: Float[Array, "N *n"]
     """Motor torque [N m]."""
-    valid: Bool[Array, " N"]
+    valid: Bool[Array, "N *n"]
     """False for rows that must not count."""
 
 

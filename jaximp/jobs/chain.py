@@ -21,9 +21,43 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.models.chain import Chain
+from jaximp.models.tip import TipImpedance
 from jaximp.types import listed
 
 PerJoint = float | list[float] | dict[str, float]
+
+
+@dataclass(frozen=True)
+class TipSettings:
+    """Keywords of `models.TipImpedance`: a human who holds the end of the robot."""
+
+    directions: str | list[list[float]] = "xyz"
+    """In which the human's impedance is looked for: axes of the base's frame, such as `"xz"`, or vectors of three
+    numbers each, orthogonal to each other."""
+    full: bool = False
+    """Also elements of the matrices between directions, such as `stiffness_xz`."""
+    mass: bool = True
+    """Columns of the human's mass."""
+    damping: bool = True
+    """Columns of damping."""
+    stiffness: bool = True
+    """Columns of stiffness."""
+    force: bool = True
+    """Columns of a constant force, which says where the spring is at rest."""
+
+    def make(self, chain: Chain) -> TipImpedance:
+        """The model.
+
+        **Raises:** `ValueError` with one line for directions that are none, no columns, and a chain without a tip.
+        """
+        if not (self.mass or self.damping or self.stiffness or self.force):
+            raise ValueError("model.human has no columns: leave out some of mass, damping, stiffness or force = false")
+        if chain.tip is None or chain.tree.tip_body < 0:
+            raise ValueError("model.human: which link is held? Name one that moves as tip in [model.robot]")
+        try:
+            return _human(chain, json.dumps(vars(self)))
+        except ValueError as error:
+            raise ValueError(f"model.human: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -101,3 +135,9 @@ def _read(path: Path, changed: int, settings: str) -> Chain:
     width = given.pop("sign_width")
     chain = Chain.from_urdf(path, **given)
     return chain.with_sign_width(width) if width != 0 else chain
+
+
+@lru_cache(maxsize=8)
+def _human(chain: Chain, settings: str) -> TipImpedance:
+    given: dict[str, Any] = json.loads(settings)
+    return TipImpedance(chain, given.pop("directions"), **given)

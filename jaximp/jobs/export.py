@@ -70,6 +70,8 @@ def export_robot(job: Job, out: Path, progress: Progress = lambda share: None) -
     """
     if isinstance(job, TrialsJob) or job.model.chain is None:
         raise ValueError("only a robot from a URDF can be written as one: give [model.robot] a urdf")
+    if job.model.tip is not None:
+        raise ValueError("a robot is exported from a recording of it alone: leave out [model.human]")
     prepared = prepare(job)
     progress(0.3)
     estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share))[0]

@@ -18,7 +18,7 @@ from jaximp.identification.filter_settings import FilterSettings, design_filters
 from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings, gap_between
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
-from jaximp.jobs.chain import ChainSettings
+from jaximp.jobs.chain import ChainSettings, TipSettings
 from jaximp.jobs.payload import PayloadSettings, payload_settings
 from jaximp.jobs.settings import check_keys, checked, optional, read, settings
 from jaximp.jobs.trials import TrialsSettings, trials_settings
@@ -119,6 +119,8 @@ class ModelSettings:
     """Whose joints were recorded."""
     chain: ChainSettings | None = None
     """The robot, where its table names a URDF."""
+    tip: TipSettings | None = None
+    """The human who holds its end, where `human` stands beside a robot from a URDF."""
     methods: tuple[int, ...] = (1,)
     """With a robot and a human: the methods of Tout et al. 2023, III-C. The first makes the report, the others stand
     beside it."""
@@ -231,7 +233,7 @@ class WindowJob:
         if self.model.chain is not None:
             chain = self.model.chain.make(self.folder)
             self.model.chain.check(chain, joints)
-            return chain, None
+            return chain, None if self.model.tip is None else self.model.tip.make(chain)
         if self.model.arm is not None:
             if joints != ("revolute", "revolute"):
                 raise ValueError(
@@ -429,7 +431,10 @@ def model_settings(table: Any) -> ModelSettings:
     check_keys(table, ["human", "robot", "arm", "methods", "drive", "robot_drift"], "[model]")
     chain = _chain(table)
     robot = None if chain else optional(RobotSettings, table.get("robot", False), "model.robot")
-    human = optional(HumanSettings, table.get("human", False), "model.human")
+    human = None if chain else optional(HumanSettings, table.get("human", False), "model.human")
+    tip = optional(TipSettings, table.get("human", False), "model.human beside a urdf") if chain else None
+    if chain is not None and tip is None and "methods" in table:
+        raise ValueError("model.methods tell a human from a robot: add [model.human], or leave them out")
     arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])
     if arm is not None:
         if robot is not None or human is not None:
@@ -443,8 +448,10 @@ def model_settings(table: Any) -> ModelSettings:
     drive = table.get("drive")
     if drive is not None and drive not in DRIVES:
         raise ValueError(f"model.drive is {drive!r}: {nearest(str(drive), DRIVES)}")
-    drift = _robot_drift(table.get("robot_drift"), human, robot)
-    return ModelSettings(human, robot, arm, chain, tuple(dict.fromkeys(methods)), drive, drift)
+    drift = _robot_drift(table.get("robot_drift"), human or tip, robot or chain)
+    if tip is not None and isinstance(drift, float) and drift > 0:
+        raise ValueError("model.robot_drift: of a robot from a URDF say which parameters may have changed, as a table")
+    return ModelSettings(human, robot, arm, chain, tip, tuple(dict.fromkeys(methods)), drive, drift)
 
 
 def _chain(table: Mapping[str, Any]) -> ChainSettings | None:
@@ -452,15 +459,12 @@ def _chain(table: Mapping[str, Any]) -> ChainSettings | None:
     robot = table.get("robot")
     if not (isinstance(robot, dict) and "urdf" in robot):
         return None
-    for other in ("human", "arm", "methods"):
-        if table.get(other, False) is not False:
-            raise ValueError(f"model.robot from a URDF stands alone: leave out model.{other}")
+    if table.get("arm", False) is not False:
+        raise ValueError("model.robot has a urdf: leave out model.arm, or describe the arm by a URDF")
     return settings(ChainSettings, robot, "model.robot")
 
 
-def _robot_drift(
-    value: Any, human: HumanSettings | None, robot: RobotSettings | None
-) -> float | dict[str, float] | None:
+def _robot_drift(value: Any, human: object, robot: object) -> float | dict[str, float] | None:
     """A share, or one for each of some parameters."""
     if value is None:
         return None
@@ -476,7 +480,7 @@ def _robot_drift(
 def _check_values(job: WindowJob) -> None:
     if all(part is None for part in (job.model.human, job.model.robot, job.model.arm, job.model.chain)):
         raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm")
-    both = job.model.human is not None and job.model.robot is not None
+    both = job.model.tip is not None or (job.model.human is not None and job.model.robot is not None)
     if both and job.robot_recording is None:
         raise ValueError("a human in a robot needs the recording of the robot alone: add a [robot_recording] table")
     if job.payload is not None and (job.model.chain is None or job.robot_recording is None):
@@ -484,6 +488,8 @@ def _check_values(job: WindowJob) -> None:
             "a [payload] needs a robot with a urdf in [model.robot], and its recording without the load: add a "
             "[robot_recording] table"
         )
+    if job.payload is not None and job.model.tip is not None:
+        raise ValueError("a [payload] is that of a robot which nobody holds: leave out [model.human]")
     if not both and job.payload is None and job.robot_recording is not None:
         raise ValueError("[robot_recording] is of use only with both model.robot and model.human, or with [payload]")
     if job.robot_recording_after is not None and job.robot_recording is None:
@@ -519,6 +525,7 @@ def _check_values(job: WindowJob) -> None:
         if not 1 <= getattr(job.filter, name) <= 12:
             raise ValueError(f"filter.{name} is {getattr(job.filter, name)}: it must lie between 1 and 12")
     offsets = [part.offset for part in (job.model.human, job.model.robot, job.model.arm, job.model.chain) if part]
+    offsets += [] if job.model.tip is None else [job.model.tip.force]
     if job.filter.high_pass is not None and any(offsets):
         raise ValueError("filter.high_pass removes what offset would explain: set offset = false in the model")
 

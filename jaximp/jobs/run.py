@@ -82,4 +82,6 @@ def infer_recording(
     job: WindowJob, recording: Recording, alone: RobotAlone = None, progress: Progress = lambda share: None
 ) -> Inference:
     """As `infer`, for recordings that are in memory."""
+    if job.model.tip is not None:
+        raise ValueError("a human at the end of a robot has no posterior: leave out [model.human], or run identify")
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)

@@ -69,6 +69,7 @@ def checked(value: Any, hint: Any, where: str) -> Any:
         float: "a number",
         list[float]: "a list of numbers",
         list[int]: "a list of whole numbers",
+        list[list[float]]: "a list of vectors",
         list[str]: "a list of text",
         dict[str, float]: "a table of numbers",
         int: "a whole number",

@@ -271,6 +271,11 @@ class Combined(_Pair):
         return dict(self._sums)
 
     @property
+    def places(self) -> tuple[int, ...]:
+        """Of each parameter's column among those of both models."""
+        return self._places
+
+    @property
     def roles(self) -> tuple[Role, ...]:
         """Of merged parameters that of the first."""
         both = self.first.roles + self.second.roles

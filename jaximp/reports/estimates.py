@@ -28,6 +28,7 @@ from jaximp.jobs.payload import Weighed
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
 from jaximp.models.chain import Chain
+from jaximp.models.tip import TipImpedance
 from jaximp.plots.wording import main_parameter, number, percent, pretty_unit, words
 from jaximp.reports.pages import (
     Alert,
@@ -150,7 +151,7 @@ def live_figures(estimates: Estimates) -> dict[str, Live]:
 
 def _is_one_window(estimates: Estimates) -> bool:
     """Whether a robot's recording is one window, so that nothing is to be shown over windows."""
-    return isinstance(estimates.model, Chain) and len(estimates.end) == 1
+    return isinstance(estimates.model, Chain | TipImpedance) and len(estimates.end) == 1
 
 
 def write_results(
