@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from jaximp.cli.terminal import JobFile, bar_of
@@ -32,7 +33,7 @@ def check(job_file: JobFile) -> None:
     table = Table("", "checked", "found", box=None, pad_edge=False)
     colour = {"ok": "green", "look": "yellow", "bad": "red"}
     for finding in findings:
-        table.add_row(f"[{colour[finding.verdict]}]{finding.verdict}[/]", finding.topic, finding.text)
+        table.add_row(f"[{colour[finding.verdict]}]{finding.verdict}[/]", *map(escape, (finding.topic, finding.text)))
     Console().print(table)
     window = "" if proposal.window is None else f"\n[window]\nlength = {proposal.window:g}"
     typer.echo(

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from jaximp.identification.residuals import Residuals
 from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval
 from jaximp.models.base import Joints, Model
+from jaximp.models.chain import Chain
 from jaximp.models.joint import HumanJoint, parameter_units
+from jaximp.models.tip import TipImpedance
 from jaximp.results import Column, Result
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
@@ -187,6 +189,9 @@ class Estimates(Result):
     @property
     def torque_unit(self) -> str:
         """`N m` of revolute joints, `N` of prismatic ones, `mixed` of both."""
+        if isinstance(self.model, Chain | TipImpedance):
+            kinds = set(self.model.joint_kinds)
+            return "mixed" if len(kinds) > 1 else "N" if kinds == {"prismatic"} else "N m"
         prismatic = set(parameter_units("prismatic").values())
         units = {
             "N" if set(part.units) <= prismatic else "N m"

@@ -25,7 +25,7 @@ from jaximp.identification.robot_changes import OTHER_METHODS, Doubts, Sameness
 from jaximp.identification.rows import Rows
 from jaximp.identification.separation import METHODS, Regression, Separation, robot_columns, separate
 from jaximp.identification.solving import Placement, Solved, Task, moments, place_windows, solve_stack
-from jaximp.identification.tip_pairs import TipPair, fit_tip
+from jaximp.identification.tip_pairs import TipPair, fit_tip, rest_note
 from jaximp.identification.weighted import weighted_fit
 from jaximp.identification.whitening import from_filtered, from_white
 from jaximp.identification.whole import of_whole_recording
@@ -220,7 +220,8 @@ def _by_methods_at_tip(
         n = found.rows
         human = Rows(tip.loaded.human[:n], jnp.asarray(found.torque), rows.valid[:n], rows.time[:n])
         doubts = Doubts({model.names[k]: why for k, why in (found.doubts or {}).items()}, OTHER_METHODS)
-        solved, notes = _predict(human, found.fit, place), (METHODS[method], found.note, *pair.notes)
+        solved = _predict(human, found.fit, place)
+        notes = [METHODS[method], found.note, rest_note(model, found.fit), *pair.notes]
         estimates = judge(own, human, solved, place, method, *notes, curves=curves, doubts=doubts)
         may_change = np.sqrt(np.diagonal(pair.change))
         of_robot = replace(estimates, robot=pair.robot_fit, robot_names=pair.robot.names, robot_change=may_change)

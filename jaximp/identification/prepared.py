@@ -234,7 +234,7 @@ def with_windows(prepared: Prepared, pipeline: Pipeline) -> Prepared:
     """The same rows for windows of another length, whose noise is estimated from what they leave."""
     white = tuple(whitened(pipeline, prepared.rows)) if prepared.white else ()
     other = replace(prepared, pipeline=pipeline, white=white, solved=())
-    return _weighted(other) if pipeline.weighs else other
+    return _weighted(other) if pipeline.weighs and other.pair is None else other
 
 
 def regress_pair(pipeline: Pipeline, robot: Model, recording: Recording) -> tuple[Regression, Rows, Measured]:

@@ -67,6 +67,8 @@ def drift_covariance(robot: Model, human: Model, theta: AnyArray, drift: Drift) 
 
     **Raises:** `ValueError` for a parameter that the robot has not.
     """
+    if not drift:
+        return np.zeros((len(robot.names), len(robot.names)))
     if isinstance(drift, Mapping):
         for name in drift:
             if name not in robot.names:
@@ -76,7 +78,7 @@ def drift_covariance(robot: Model, human: Model, theta: AnyArray, drift: Drift) 
         share = np.array([drift.get(name, 0.0) for name in robot.names])
     else:
         share = np.zeros(len(robot.names))
-        share[np.setdiff1d(np.arange(len(share)), own_columns(robot, human))] = drift or 0.0
+        share[np.setdiff1d(np.arange(len(share)), own_columns(robot, human))] = drift
     return np.diag((share * np.asarray(theta)) ** 2)
 
 

@@ -27,8 +27,9 @@ from jaximp.identification.solving import Placement
 from jaximp.identification.weighted import by_size, sizes_of_joints
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit, WindowFit
-from jaximp.models.base import Combined
-from jaximp.types import Numbers
+from jaximp.models.base import Combined, Model
+from jaximp.models.tip import TipImpedance
+from jaximp.types import Numbers, listed
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def _with_errors(found: Separated, passed_on: Numbers, pair: TipPair) -> tuple[N
     return found.u, np.sqrt(np.maximum(np.diagonal(covariance), 0)), float(dof.min())
 
 
-def _motions_differ(pair: TipPair, moved: Numbers, valid: Numbers) -> tuple[str, dict[int, str] | None]:
+def _motions_differ(pair: TipPair, moved: Numbers, valid: NDArray[np.bool_]) -> tuple[str, dict[int, str] | None]:
     """What is to be known of method 3, and why nothing can be told where the motions are two."""
     theta, whole = pair.robot.theta, np.asarray(pair.loaded.robot)[: len(moved)]
     differs, own = (float(np.sqrt(np.mean((x @ theta)[valid] ** 2))) for x in (moved, whole))
@@ -189,3 +190,14 @@ def _motions_differ(pair: TipPair, moved: Numbers, valid: Numbers) -> tuple[str,
         f"differs by {differs / own:.0%})"
     )
     return why, dict.fromkeys(range(pair.loaded.human.shape[-1]), why)
+
+
+def rest_note(model: Model, fit: SlidingFit) -> str:
+    """Where the human's spring is at rest, of all windows that are known; nothing for a model that does not say it."""
+    theta = np.asarray(fit.theta)
+    theta = theta[np.isfinite(theta).all(axis=1)]
+    if not isinstance(model, TipImpedance) or not {"stiffness", "force"} <= set(model.kinds) or not len(theta):
+        return ""
+    place = np.median(np.asarray(model.equilibrium(theta)), axis=0)
+    several = [f"{label} {one:.4g} m" for label, one in zip(model.labels, place, strict=True)]
+    return f"the human's spring is at rest at {listed(several)} (median over windows)"

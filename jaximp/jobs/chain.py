@@ -20,6 +20,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaximp.models.chain import Chain
 from jaximp.models.tip import TipImpedance
 from jaximp.types import listed
@@ -140,4 +142,9 @@ def _read(path: Path, changed: int, settings: str) -> Chain:
 @lru_cache(maxsize=8)
 def _human(chain: Chain, settings: str) -> TipImpedance:
     given: dict[str, Any] = json.loads(settings)
-    return TipImpedance(chain, given.pop("directions"), **given)
+    directions = given.pop("directions")
+    if isinstance(directions, list):
+        if not all(len(one) == 3 for one in directions):
+            raise ValueError("directions must be axes such as 'xz', or vectors of three numbers each")
+        directions = np.array(directions)
+    return TipImpedance(chain, directions, **given)

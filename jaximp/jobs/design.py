@@ -197,6 +197,8 @@ def parse_design_job(text: str, folder: Path = Path()) -> DesignJob:
     model = model_settings(tables["model"])
     if model == ModelSettings():
         raise ValueError("[model] is empty: write human = true, or robot = true, or both, or an arm, or a robot's urdf")
+    if model.tip is not None:
+        raise ValueError("a motion is designed for a robot from a URDF that nobody holds: leave out [model.human]")
     design = settings(DesignSettings, tables.get("design", {}), "design")
     for name, choices in (("objective", OBJECTIVES), ("method", METHODS)):
         chosen = getattr(design, name)

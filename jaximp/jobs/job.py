@@ -432,7 +432,7 @@ def model_settings(table: Any) -> ModelSettings:
     chain = _chain(table)
     robot = None if chain else optional(RobotSettings, table.get("robot", False), "model.robot")
     human = None if chain else optional(HumanSettings, table.get("human", False), "model.human")
-    tip = optional(TipSettings, table.get("human", False), "model.human beside a urdf") if chain else None
+    tip = optional(TipSettings, table.get("human", False), "model.human") if chain else None
     if chain is not None and tip is None and "methods" in table:
         raise ValueError("model.methods tell a human from a robot: add [model.human], or leave them out")
     arm = None if table.get("arm", False) is False else arm_of_joints(table["arm"])

@@ -52,6 +52,10 @@ class TipImpedance(Model):
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     """Directions of each element of a matrix."""
     kinds: tuple[str, ...] = eqx.field(static=True)
+    joint_kinds: tuple[str, ...] = eqx.field(static=True)
+    """`revolute` or `prismatic`, of the robot's joints."""
+    labels: tuple[str, ...] = eqx.field(static=True)
+    """Of the directions, as they stand in the names."""
     _digest: str = eqx.field(static=True)
 
     def __init__(
@@ -68,12 +72,12 @@ class TipImpedance(Model):
         if chain.tip is None:
             raise ValueError(f"{chain.robot} has no tip: pass tip= with one of its links when it is read")
         labels, vectors = _directions(directions)
-        k = len(labels)
+        k, self.labels = len(labels), tuple(labels)
         self.tree, self.directions, self._digest = chain.tree, vectors, f"{chain.robot} {chain.digest}"
         self.pairs = tuple((i, j) for i in range(k) for j in range(i, k) if full or i == j)
         wanted = {"mass": mass, "damping": damping, "stiffness": stiffness, "force": force}
         self.kinds = tuple(kind for kind, is_wanted in wanted.items() if is_wanted)
-        self.n_joints, self.label = chain.n_joints, "human"
+        self.n_joints, self.label, self.joint_kinds = chain.n_joints, "human", chain.joint_kinds
         names = [(kind, pair) for kind in self.kinds for pair in self._elements(kind)]
         self.names = tuple(f"{kind}_{_label(labels, pair)}" for kind, pair in names)
         self.units = tuple(UNITS[kind] for kind, _ in names)

@@ -22,6 +22,7 @@ from .posterior import torque_bands as torque_bands
 from .registry import figure_of as figure_of
 from .robots import load_by_method as load_by_method
 from .robots import parameters_against_urdf as parameters_against_urdf
+from .robots import parameters_by_method as parameters_by_method
 from .robots import robot as robot
 from .style import Panel as Panel
 from .style import curves as curves

@@ -14,7 +14,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.separation import METHODS
 from jaximp.least_squares.window import confidence_interval
+from jaximp.models.chain import Chain
 from jaximp.models.joint import parameter_units
+from jaximp.models.tip import TipImpedance
 from jaximp.plots.style import (
     BLACK,
     BLUE,
@@ -536,7 +538,9 @@ def _spread_and_error(estimates: Estimates, k: int) -> tuple[float, float]:
 
 
 def effort(estimates: Estimates, joint: int) -> tuple[str, str]:
-    """Whether the joint has a torque or a force, told by the units of its parameters."""
+    """Whether the joint has a torque or a force, told by its kind or by the units of its parameters."""
+    if isinstance(estimates.model, Chain | TipImpedance):
+        return ("force", "N") if estimates.model.joint_kinds[joint] == "prismatic" else ("torque", "N m")
     own = f"joint{joint + 1}."
     units = {u for name, u in zip(estimates.names, estimates.units, strict=True) if not name.startswith("joint")}
     units |= {u for name, u in zip(estimates.names, estimates.units, strict=True) if name.startswith(own)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,15 @@ from matplotlib.figure import Figure
 
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.payload import Payload
+from jaximp.identification.quantities import Quantities
 from jaximp.models import rigid_body
 from jaximp.models.chain import Chain
 from jaximp.plots.style import BLACK, BLUE, GREEN, ORANGE, PALE, VERMILLION, WIDTH, Numbers, styled
-from jaximp.plots.wording import pretty_unit
+from jaximp.plots.wording import pretty_unit, with_unit
 from jaximp.types import AnyArray
 
+ACROSS = 4
+"""Panels side by side, of quantities by several methods."""
 POSES = 5
 """Of a motion, that are drawn."""
 WIDE = 30.0
@@ -117,22 +120,48 @@ def _intervals(
 @styled
 def load_by_method(loads: Sequence[Payload]) -> Figure:
     """Mass and centre of mass of a load by several methods, with intervals of 95 %."""
-    figure = Figure(figsize=(WIDTH, 0.9 + 0.25 * len(loads)))
-    panels, place = figure.subplots(1, 4, sharey=True), np.arange(len(loads))
-    titles = ("mass (kg)", *(f"centre, {axis} (mm)" for axis in "xyz"))
-    for k, (panel, title) in enumerate(zip(panels, titles, strict=True)):
-        factor, found = (1.0, loads) if k == 0 else (1e3, [load.centre for load in loads])
-        which = max(k - 1, 0)
-        value = factor * np.array([one.theta[which] for one in found])
-        low, high = factor * np.array([[end[which] for end in one.interval()] for one in found]).T
-        panel.errorbar(
-            value, place, xerr=np.stack([value - low, high - value]), fmt="o", color=BLUE, capsize=2, markersize=3
-        )
+    masses, centres = [_three(load, 0) for load in loads], [load.centre for load in loads]
+    panels = {"mass (kg)": np.array(masses)}
+    panels |= {f"centre, {axis} (mm)": 1e3 * np.array([_three(c, k) for c in centres]) for k, axis in enumerate("xyz")}
+    return _by_method([f"method {load.method}" for load in loads], panels)
+
+
+@styled
+def parameters_by_method(several: Sequence[Estimates]) -> Figure:
+    """All parameters of one window by several methods, with intervals of 95 %; pale where they cannot be trusted."""
+    named = list(zip(several[0].names, several[0].units, strict=True))
+    panels = {
+        with_unit(name, unit): np.array([_three(one, (0, k)) for one in several])
+        for k, (name, unit) in enumerate(named)
+    }
+    trusted = np.array([[one.trusted_in(name)[0] for one in several] for name, _ in named])
+    return _by_method([f"method {one.method}" for one in several], panels, trusted)
+
+
+def _three(of: Quantities | Estimates, k: int | tuple[int, int]) -> list[float]:
+    """Lower end, value and upper end of one number."""
+    low, high = of.interval()
+    return [float(x[k]) for x in (low, of.value, high)]
+
+
+def _by_method(labels: Sequence[str], panels: Mapping[str, Numbers], trusted: AnyArray | None = None) -> Figure:
+    """A panel for each quantity, whose rows (methods, 3) are lower end, value and upper end."""
+    rows, place = -(-len(panels) // ACROSS), np.arange(len(labels))
+    figure = Figure(figsize=(WIDTH, rows * (0.75 + 0.2 * len(labels)) + 0.15))
+    axes = figure.subplots(rows, ACROSS, sharey=True, squeeze=False).ravel()
+    for k, (panel, (title, ends)) in enumerate(zip(axes, panels.items(), strict=False)):
+        sure = np.ones(len(ends), bool) if trusted is None else trusted[k]
+        for which, color in ((sure, BLUE), (~sure, PALE)):
+            low, value, high = ends[which].T
+            reach = np.stack([value - low, high - value])
+            panel.errorbar(value, place[which], xerr=reach, fmt="o", color=color, capsize=2, markersize=3)
         panel.set_title(title, loc="left")
         panel.margins(x=0.15)
-        panel.locator_params(axis="x", nbins=4)
-    panels[0].set_yticks(place, [f"method {load.method}" for load in loads])
-    panels[0].set_ylim(len(loads) - 0.4, -0.6)
+        panel.locator_params(axis="x", nbins=3)
+    for panel in axes[len(panels) :]:
+        panel.remove()
+    axes[0].set_yticks(place, labels)
+    axes[0].set_ylim(len(labels) - 0.4, -0.6)
     return figure
 
 

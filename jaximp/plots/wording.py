@@ -39,4 +39,5 @@ def pretty_unit(unit: str) -> str:
 
 def main_parameter(names: Sequence[str]) -> str:
     """The parameter that stands for all where only one is shown: the stiffness, else the first."""
-    return next((name for name in names if name.endswith("stiffness")), names[0])
+    stiffness = [name for name in names if name.endswith("stiffness")]
+    return next(iter([*stiffness, *(name for name in names if name.startswith("stiffness_"))]), names[0])

@@ -99,7 +99,7 @@ CAPTIONS = {
     "Their sum is the gain. Where the last ones are not zero the bank is too short, and the stiffness takes the rest.",
     "window_lengths": "The same recording at several window lengths. Short windows scatter, long ones hide changes: a "
     "spread well above the standard error is a true change, or something that the model lacks.",
-    "methods": "The same windows by several methods of telling the human from the robot.",
+    "methods": "The same by several methods of telling the human from the robot, with intervals of 95 %.",
 }
 """Figures in the order of the report, and how to read them."""
 
@@ -198,7 +198,8 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
     if lengths:
         figures["window_lengths"] = plots.window_lengths(lengths)
     if len(estimates_list) > 1:
-        figures["methods"] = plots.methods(estimates_list)
+        one_window = _is_one_window(main)
+        figures["methods"] = plots.parameters_by_method(estimates_list) if one_window else plots.methods(estimates_list)
     return {name: plots.png(figure) for name, figure in figures.items()}
 
 

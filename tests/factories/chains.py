@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from factories.robots import joint, link, robot
 from jaximp.identification.payload import load_columns
-from jaximp.models import Chain
+from jaximp.models import Chain, TipImpedance
 from jaximp.recordings import recording_from_arrays
 from jaximp.types import Recording
 
@@ -21,6 +21,14 @@ TWO_JOINTS = robot(
     link("fore", 1.0, "0.02 0.01 0.1"),
     name="two_joints",
 )
+GRIP = joint("grip", "fore", "hand", "fixed", "0 0 0.25") + '<link name="hand"/>'
+HELD = TWO_JOINTS.replace("</robot>", f"{GRIP}</robot>")
+"""The same with a hand, which somebody can hold."""
+HUMAN = {
+    "mass_x": 1.5, "mass_z": 0.8, "damping_x": 20.0, "damping_z": 10.0, "stiffness_x": 150.0, "stiffness_z": 90.0,
+    "force_x": -30.0, "force_z": -20.0,
+}  # fmt: skip
+"""Who holds it, in the plane of the arm."""
 RATE, SECONDS = 100.0, 20.0
 SIZES, COLOUR = np.array([0.3, 0.03]), 0.8
 """Standard deviations of the torques' noise [N m], and how much neighbouring samples have in common."""
@@ -87,6 +95,14 @@ def with_load(
     torque = np.asarray(chain.observation_matrix(q, dq, ddq)) @ theta + noisy
     position = position - motion(seed)[1] + q
     return recording_from_arrays(time, position, torque / gain, name=f"run {seed}", **also)  # type: ignore[arg-type]
+
+
+def held(chain: Chain, human: TipImpedance, seed: int, moves: int | None = None) -> Recording:
+    """The motion of one seed with the noise of another, of a robot that a human holds."""
+    alone = with_load(chain, seed, moves=moves)
+    W = np.asarray(human.observation_matrix(*motion(seed if moves is None else moves)[1:]))
+    theta = np.array([HUMAN[name] for name in human.names])
+    return recording_from_arrays(alone.time, alone.position, alone.torque + W @ theta, name=f"held {seed}")
 
 
 def recording(chain: Chain, seed: int, seconds: float = SECONDS, noise: float = 1.0) -> Recording:
