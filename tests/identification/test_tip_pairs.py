@@ -116,7 +116,8 @@ def test_errors_hold_a_change_of_the_robot(models: tuple[Chain, TipImpedance, Co
     held = whole(pair_of(models, 3, change=np.outer(3e3 * apart, 3e3 * apart)), method, models[2]).fit
     expected = np.hypot(plain.stderr, 3e3 * (moved.theta - plain.theta))
     np.testing.assert_allclose(held.stderr, expected, rtol=5e-2)  # weights settle to some thousandths
-    assert np.asarray(held.stderr / plain.stderr).max() > 2
+    # Method 2 lets the friction be what it is in each recording: only links are the robot's and the human's together.
+    assert bool(np.asarray(held.stderr / plain.stderr).max() > 2) is (method != 2)
 
 
 @pytest.mark.parametrize("method", [1, 2, 3, 4])
