@@ -22,7 +22,7 @@ from jaximp.design.limits import Limits
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.pipeline import WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
-from jaximp.jobs.chain import ChainSettings
+from jaximp.jobs.chain import ChainSettings, TipSettings
 from jaximp.jobs.design import ClearanceSettings, DesignSettings, EncoderSettings
 from jaximp.jobs.job import HumanSettings, ModelSettings, ReflexSettings, RobotSettings, WindowJob
 from jaximp.jobs.payload import PayloadSettings
@@ -71,7 +71,13 @@ RECORDING_JOB = (
     Table(
         "[model.robot] with a URDF",
         ChainSettings,
-        "A robot of all joints that its URDF moves. It stands alone, without a human. See [robots](robots.md).",
+        "A robot of all joints that its URDF moves. See [robots](robots.md).",
+    ),
+    Table(
+        "[model.human] beside a URDF",
+        TipSettings,
+        "A human who holds the end of the robot, its `tip`: `[robot_recording]` is the robot alone. See "
+        "[robots](robots.md#a-human-at-the-end-of-the-robot).",
     ),
     Table(
         "[model.arm]",

@@ -50,11 +50,13 @@ def simulate(
     urdf: Annotated[
         Path | None, typer.Option("--urdf", help="robot: its URDF; by default an arm of six joints.")
     ] = None,
+    human: Annotated[bool, typer.Option("--human", help="robot: somebody holds its end.")] = False,
 ) -> None:
     """Write simulated recordings, with a job file that `identify` reads.
 
     `rig`: a rig of one joint, alone and held. `arm`: reaching movements of an arm whose hand is perturbed at times, and
-    postures that it keeps; truth.json holds what is to be found. `robot`: an arm that is like its URDF, but not quite.
+    postures that it keeps; truth.json holds what is to be found. `robot`: an arm that is like its URDF, but not quite,
+    and with --human an arm whose end is held, beside the same alone.
     """
     from jaximp.recordings.outputs import new_folder
 
@@ -66,7 +68,7 @@ def simulate(
         elif what is What.robot:
             from jaximp.simulation.robot_recordings import write_robot_recordings
 
-            write_robot_recordings(folder, urdf, 30.0 if duration is None else duration, seed, progress)
+            write_robot_recordings(folder, urdf, 30.0 if duration is None else duration, seed, progress, human)
         else:
             from jaximp.simulation.arm_recordings import Sensors, write_arm_recordings
 

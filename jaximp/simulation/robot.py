@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaximp.models.base import Model
 from jaximp.models.chain import Chain
+from jaximp.models.tip import TipImpedance
 from jaximp.motion.trajectories import FourierSeries, at_rest
 from jaximp.types import AnyArray, Numbers
 
@@ -93,11 +94,13 @@ def simulate_robot(
     duration: float,
     drive: RobotDrive | None = None,
     seed: int = 0,
+    human: tuple[TipImpedance, Float[AnyArray, " h"]] | None = None,
 ) -> RobotRecording:
     """A robot that follows a motion for some `duration` [s].
 
     **Arguments:** the `chain`, with friction and rotors where the robot has some; its true standard `parameters`
-    (`Chain.base.standard_names`); the `motion` that its controller is asked for.
+    (`Chain.base.standard_names`); the `motion` that its controller is asked for; the `human` who holds its end, by
+    model and parameters, of whom the controller knows nothing.
 
     **Raises:** `ValueError` for a motion of other joints, and for a duration of less than a second.
     """
@@ -109,7 +112,7 @@ def simulate_robot(
     time = np.arange(round(duration * drive.rate)) / drive.rate
     theta = np.asarray(chain.base.map) @ np.asarray(parameters)
     asked = motion(jnp.asarray(np.arange(STEPS * len(time)) / (STEPS * drive.rate)))
-    position, torque = (np.asarray(x)[::STEPS] for x in _follow(chain, theta, asked, drive))
+    position, torque = (np.asarray(x)[::STEPS] for x in _follow(chain, theta, asked, drive, human))
     random = np.random.default_rng(seed)
     effort = np.where(np.isfinite(chain.limits.effort), chain.limits.effort, np.abs(torque).max(axis=0))
     noise = drive.torque_noise * effort * random.normal(size=torque.shape)
@@ -117,10 +120,18 @@ def simulate_robot(
     return RobotRecording(time, read, torque + noise, position, torque)
 
 
-def _follow(chain: Chain, theta: Numbers, asked: tuple[Array, ...], drive: RobotDrive) -> tuple[Array, Array]:
+def _follow(
+    chain: Chain,
+    theta: Numbers,
+    asked: tuple[Array, ...],
+    drive: RobotDrive,
+    human: tuple[TipImpedance, Numbers] | None,
+) -> tuple[Array, Array]:
     """(S, n) position and motor torque at every step, of a controller that expects the URDF's own torque."""
     model, true = chain.smoothed(GRADUAL), jnp.asarray(theta)
-    expected = model.regressor(*asked) @ jnp.asarray(chain.parameters)
+    expected = model.observation_matrix(*asked) @ jnp.asarray(chain.parameters)
+    if human is not None:
+        model, true = model + human[0], jnp.concatenate([true, jnp.asarray(human[1], float)])
     size = _mass_and_rest(model, true, asked[0].mean(axis=0), jnp.zeros(chain.n_joints))[0].diagonal()
     return _followed(model, true, size, (asked[0], asked[1], expected), drive.rate, drive.bandwidth)
 
@@ -150,5 +161,5 @@ def _mass_and_rest(model: Model, theta: Array, q: Array, dq: Array) -> tuple[Arr
     """(n, n) mass matrix with rotors, and (n,) all other torque, by one look at n + 2 accelerations and velocities."""
     n = len(q)
     at, fast = jnp.broadcast_to(q, (n + 2, n)), jnp.zeros((n + 2, n)).at[n + 1].set(dq)
-    torque = model.regressor(at, fast, jnp.eye(n + 2, n)) @ theta
+    torque = model.observation_matrix(at, fast, jnp.eye(n + 2, n)) @ theta
     return (torque[:n] - torque[n]).T, torque[n + 1]

@@ -62,7 +62,10 @@ def jaximp_commands(page: Path) -> list[str]:
 def marked(values: list[Any]) -> list[Any]:
     """Parameters of a test: what draws from posteriors or designs is slow, the search of a window length, and robots
     that are simulated."""
-    slow = [any(word in str(value) for word in ("posterior", "design", "jaximp check", "payload")) for value in values]
+    slow = [
+        any(word in str(value) for word in ("posterior", "design", "jaximp check", "payload", "robots"))
+        for value in values
+    ]
     return [pytest.param(x, marks=pytest.mark.slow if late else ()) for x, late in zip(values, slow, strict=True)]
 
 

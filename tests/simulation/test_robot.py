@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximp.models import SIX_JOINT_ARM, Chain
+from factories.chains import HELD
+from factories.robots import TREE
+from jaximp.jobs import WindowJob, read_job
+from jaximp.models import SIX_JOINT_ARM, Chain, TipImpedance
 from jaximp.models.spatial import PARAMETERS
 from jaximp.simulation import RobotDrive, RobotRecording, exciting_motion, simulate_robot, true_parameters
+from jaximp.simulation.robot_recordings import write_robot_recordings
+from jaximp.types import Recording
 
 LOCKED = ("joint_4", "joint_5", "joint_6")
 
@@ -33,6 +41,43 @@ def test_torque_is_that_of_the_motion(chain: Chain, recording: RobotRecording) -
     fast = np.abs(dq) > 0.2  # where friction has turned
     error = (torque[1:-1] - needed)[50:][fast[50:]]
     assert np.sqrt((error**2).mean()) < 0.01 * np.sqrt((torque**2).mean())
+
+
+def test_a_human_who_holds_it_takes_torque(chain: Chain) -> None:
+    """What the motors need is the torque of the robot and of the human's impedance."""
+    theta, human = np.array([1.0, 2.0, 20.0, 30.0, 150.0, 100.0, -40.0, 10.0]), TipImpedance(chain, "xz")
+    parameters, motion = true_parameters(chain, 3), exciting_motion(chain, 4.0)
+    made = simulate_robot(chain, parameters, motion, 4.0, RobotDrive(rate=250), 1, (human, theta))
+    rate, q = 250, made.true_position
+    dq, ddq = (q[2:] - q[:-2]) * rate / 2, (q[2:] - 2 * q[1:-1] + q[:-2]) * rate**2
+    of_robot = np.asarray(chain.observation_matrix(q[1:-1], dq, ddq)) @ (np.asarray(chain.base.map) @ parameters)
+    of_human = np.asarray(human.observation_matrix(q[1:-1], dq, ddq)) @ theta
+    fast = np.abs(dq) > 0.2
+    error = (made.true_torque[1:-1] - of_robot - of_human)[50:][fast[50:]]
+    assert np.sqrt((error**2).mean()) < 0.02 * np.sqrt((of_human**2).mean())
+
+
+@pytest.mark.slow  # simulates an arm of two joints twice
+def test_recordings_of_a_held_robot_come_with_their_job(tmp_path: Path) -> None:
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(HELD, encoding="utf-8")
+    out = tmp_path / "out"
+    out.mkdir()
+    write_robot_recordings(out, urdf, duration=3.0, held=True)
+    job = read_job(out / "job.toml")
+    assert isinstance(job, WindowJob)
+    alone, held = job.load_robot_alone(), job.load()
+    assert isinstance(alone, Recording)
+    assert len(alone) == len(held) == 1500
+    assert np.abs(held.torque - alone.torque).max() > 5
+    truth = json.loads((out / "truth.json").read_text())
+    robot, human = job.models(held.joints)
+    assert robot is not None
+    assert human is not None
+    assert set(truth) == {*robot.names, *human.names}
+    (tmp_path / "tree.urdf").write_text(TREE, encoding="utf-8")
+    with pytest.raises(ValueError, match="nobody knows which end a human would hold"):
+        write_robot_recordings(out, tmp_path / "tree.urdf", duration=3.0, held=True)
 
 
 def test_it_follows_what_it_is_asked_for_within_its_limits(chain: Chain, recording: RobotRecording) -> None:
