@@ -62,10 +62,8 @@ def jaximp_commands(page: Path) -> list[str]:
 def marked(values: list[Any]) -> list[Any]:
     """Parameters of a test: what draws from posteriors or designs is slow, the search of a window length, and robots
     that are simulated."""
-    slow = [
-        any(word in str(value) for word in ("posterior", "design", "jaximp check", "payload", "robots"))
-        for value in values
-    ]
+    words = ("posterior", "design", "jaximp check", "payload", "robots.md")
+    slow = [any(word in str(value) for word in words) for value in values]
     return [pytest.param(x, marks=pytest.mark.slow if late else ()) for x, late in zip(values, slow, strict=True)]
 
 

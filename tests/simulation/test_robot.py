@@ -43,6 +43,7 @@ def test_torque_is_that_of_the_motion(chain: Chain, recording: RobotRecording) -
     assert np.sqrt((error**2).mean()) < 0.01 * np.sqrt((torque**2).mean())
 
 
+@pytest.mark.slow  # compiles a simulation of its own
 def test_a_human_who_holds_it_takes_torque(chain: Chain) -> None:
     """What the motors need is the torque of the robot and of the human's impedance."""
     theta, human = np.array([1.0, 2.0, 20.0, 30.0, 150.0, 100.0, -40.0, 10.0]), TipImpedance(chain, "xz")
