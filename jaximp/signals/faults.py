@@ -48,6 +48,9 @@ BLOCK = 8
 """Samples that noise does not repeat to the last digit."""
 CROWDED_VALUE = 0.01
 """Share of a noisy signal's samples that one value may have."""
+CROWD, NEIGHBOURS = 4.0, 5
+"""It must have so many times the samples of the values beside it, of so many on each side: where few digits were
+written, every value has many."""
 MOTION_CUTOFF = 20.0
 """Of the motion that the torque at a limit is predicted from [Hz]."""
 
@@ -343,7 +346,11 @@ def crowded_value(x: Numbers) -> float | None:
     if _rounded_by(x) is None:
         return None
     values, counts = np.unique(x[np.isfinite(x)], return_counts=True)
-    most = float(values[counts.argmax()])
+    k = int(counts.argmax())
+    most = float(values[k])
+    beside = np.delete(counts[max(k - NEIGHBOURS, 0) : k + NEIGHBOURS + 1], min(k, NEIGHBOURS))
+    if len(beside) and counts[k] < CROWD * np.median(beside):
+        return None
     at = x == most
     visits = int((np.diff(np.r_[False, at].astype(np.int8)) > 0).sum())
     inside = values[0] < most < values[-1]

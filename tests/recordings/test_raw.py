@@ -142,6 +142,16 @@ def test_what_a_recorder_made_of_the_torque_is_masked(name: str, kind: str, shar
     assert (~recording.valid).mean() == pytest.approx(share, rel=0.25)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_few_digits_make_no_dead_zone(seed: int) -> None:
+    """A robot's friction holds its torque near two values, each of which then stands in the file hundreds of times."""
+    random, (position, _) = np.random.default_rng(seed), joint()
+    torque = 0.35 * np.sign(np.gradient(position)) + 0.1 * position + 0.05 * random.normal(size=len(TIME))
+    recording = recording_from_arrays(TIME, position, np.round(torque, 2))
+    assert np.unique(recording.torque, return_counts=True)[1].max() > 0.01 * len(TIME)
+    assert recording.valid.all()
+
+
 @pytest.mark.parametrize("decimals", [None, 4], ids=["all digits", "four decimals"])
 def test_a_slower_torque_that_was_joined_by_lines_is_a_smooth_curve_again(decimals: int | None) -> None:
     (position, _), torque = joint(), torque_with("slower")
