@@ -8,5 +8,3 @@ from .programs import ConsistentFit as ConsistentFit
 from .programs import Ranges as Ranges
 from .programs import consistent_fit as consistent_fit
 from .programs import consistent_ranges as consistent_ranges
-from .sampling import ConsistentPosterior as ConsistentPosterior
-from .sampling import consistent_posterior as consistent_posterior

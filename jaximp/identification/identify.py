@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaximp.identification.as_robot import judged_as_robot
 from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.judging import judge
 from jaximp.identification.misfit import find_human_misfits, find_misfits
@@ -95,11 +96,14 @@ def in_windows(
     if not prepared.solved and prepared.stackable:
         prepared = solve_windows([prepared], longest=longest)[0]
     found = _in_windows(prepared, progress, longest, curves)
-    if prepared.pair is not None or not prepared.pipeline.once or not curves:
+    if prepared.pair is not None or not prepared.pipeline.once:
         return found
+    if not curves:
+        return [judged_as_robot(prepared, found[0])]
     theta = of_whole_recording(prepared, found[0].value)
     held_out = None if prepared.held_out is None else Residuals.of(prepared.held_out, theta)
-    return [replace(found[0], residuals=Residuals.of(prepared.rows, theta), held_out=held_out)]
+    residuals = Residuals.of(prepared.rows, theta)
+    return [judged_as_robot(prepared, replace(found[0], residuals=residuals, held_out=held_out))]
 
 
 def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, curves: bool) -> list[Estimates]:

@@ -30,7 +30,7 @@ def of_whole_recording(prepared: Prepared, theta: Numbers) -> Numbers:
     """(p,) the parameters of the recording as one window, from `theta` (M, p) of its windows where that is one."""
     if len(theta) == 1:
         return np.asarray(theta[0])
-    W, torque, valid = _solved(prepared)
+    W, torque, valid = solved_rows(prepared)
     return np.asarray(np.linalg.lstsq(W[valid], torque[valid])[0])
 
 
@@ -52,12 +52,12 @@ def whole_recording(prepared: Prepared, fit: SlidingFit) -> Whole:
             "the recording does not determine all parameters: it needs a motion that excites every joint, or a "
             "smaller model"
         )
-    covariance, dof = covariance_of(*_solved(prepared))
+    covariance, dof = covariance_of(*solved_rows(prepared))
     place = place_windows(prepared.pipeline, prepared.rows)
     return Whole(theta[0], covariance + common_covariance(prepared, prepared.rows, fit, place)[0], dof)
 
 
-def _solved(prepared: Prepared) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
+def solved_rows(prepared: Prepared) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
     """(S, n, p) and (S, n): the rows that estimates come from, and which of them count."""
     generalised = len(prepared.white) == 1 and not prepared.pipeline.ordinary
     rows = prepared.weighted or (prepared.white[0] if generalised else prepared.rows)

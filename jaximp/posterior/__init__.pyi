@@ -31,3 +31,5 @@ from .priors import MultivariateNormal as MultivariateNormal
 from .priors import Normal as Normal
 from .priors import Prior as Prior
 from .priors import make_prior as make_prior
+from .robots import ConsistentPosterior as ConsistentPosterior
+from .robots import consistent_posterior as consistent_posterior

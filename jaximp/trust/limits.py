@@ -27,6 +27,9 @@ class TrustLimits:
     min_excitation_ratio: float = 5.0
     """How far each column must rise above what noise in the position alone would build: a ratio r biases the
     estimate by about 1/r^2, four percent at 5."""
+    max_unreal: float = 0.05
+    """Share by which the squares that a robot's model leaves may grow, if all its links must be real bodies and its
+    friction above zero: joints in another order, a wrong sign or the wrong gravity ask for a robot that cannot be."""
     max_at_limit: float = 0.02
     """Share of a window's samples whose torque was cut off at a limit of its sensor or motor; they are left out."""
     min_valid_share: float = 0.5

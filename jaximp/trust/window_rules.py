@@ -88,6 +88,16 @@ class Windows:
     """(M, 3) inertia, damping and stiffness at a human joint; None of anything else."""
     outside: Any = 1.0
     """(M, 3) by what factor these lie outside of what the joint can have, see `plausibility.times_outside`."""
+    of_robot: bool = False
+    """Whether the parameters are those of the links of a robot from a URDF."""
+    unreal: float = 0.0
+    """By what share the squares grow that its model leaves, if it must be a robot that can be; 0 within the errors."""
+    unforeseen: float = 0.0
+    """The share of the squared torque of a held-out recording that a robot's model leaves."""
+    opposed: str = ""
+    """Which joint of a robot carries its weight the other way round than by the URDF's own masses."""
+    out_of_reach: str = ""
+    """Which joint of a robot was recorded where the URDF says that it cannot be."""
     tested: bool = False
     """Whether the model of the whole record was tested for what it lacks."""
     missing: str = ""
@@ -293,8 +303,10 @@ def _question(w: Windows, limits: TrustLimits) -> str:
 
 
 def _least_vaf(w: Windows, limits: TrustLimits) -> float:
-    """Tests of the model say more than the share of the variance, which noise lowers too."""
-    return -np.inf if w.tested and limits.min_vaf is None else limits.usual_vaf
+    """Tests of the model say more than the share of the variance, which noise lowers too; of a robot, whose model may
+    be wrong in all its joints at once, they do not."""
+    tells_more = w.tested and not w.of_robot
+    return -np.inf if tells_more and limits.min_vaf is None else limits.usual_vaf
 
 
 def _asymmetric(w: Windows, limits: TrustLimits) -> Any:
@@ -385,6 +397,40 @@ RULES: tuple[Rule[Windows], ...] = (
         ),
         lambda w, limits: f"the residual is {w.residual / w.usual_residual:.2g} times that of other windows",
         lambda w, limits: "did the joint change here?",
+    ),
+    Rule(
+        "positions that the robot can reach",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), bool(w.out_of_reach)),
+        lambda w, limits: w.out_of_reach,
+        lambda w, limits: "is the unit of the position the right one, and the order of the joints that of the URDF?",
+    ),
+    Rule(
+        "weight that is carried as the URDF's masses ask for",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), bool(w.opposed)),
+        lambda w, limits: w.opposed,
+        lambda w, limits: "are gravity's direction and the signs of torque and position right?",
+    ),
+    Rule(
+        "a robot that can be",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), w.unreal > limits.max_unreal),
+        lambda w, limits: (
+            "these are not the parameters of a robot: if its links are to be real bodies, and its friction above "
+            f"zero, the squares that the model leaves are {w.unreal:.0%} more"
+        ),
+        lambda w, limits: (
+            "are order, signs and units of the joints those of the URDF, for positions and for torques, is gravity's "
+            "direction right, and does the model have the friction that the robot has?"
+        ),
+    ),
+    Rule(
+        "a held-out recording that is predicted",
+        POOR,
+        lambda w, limits: np.full(np.shape(w.vaf), not 1 - w.unforeseen >= limits.usual_vaf),
+        lambda w, limits: f"the model leaves {w.unforeseen:.0%} of the squared torque of the held-out recording",
+        lambda w, limits: "were both recorded alike, and is the model the right one?",
     ),
     Rule(
         POSITIVE_INERTIA,

@@ -10,7 +10,8 @@ from scipy import stats
 
 from factories.real_robots import PENDULUM, PLANAR, another, estimated, is_real
 from factories.robots import joint, link, robot
-from jaximp.consistency import cone_of, consistent_fit, consistent_ranges, programs
+from jaximp.consistency import barrier, cone_of, consistent_fit, consistent_ranges, programs
+from jaximp.consistency.cone import pose
 from jaximp.models.chain import Chain
 from jaximp.models.urdf import SIX_JOINT_ARM, parse_urdf
 
@@ -181,3 +182,14 @@ def test_ranges_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(programs, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'jaximp\[robots\]'"):
         consistent_ranges(*given)
+
+
+@pytest.mark.parametrize("chain", [PENDULUM, PLANAR, ARM], ids=["pendulum", "planar", "arm"])
+@pytest.mark.parametrize("errors", [0.0, 3.0, 30.0])
+def test_how_far_robots_are_is_known_without_a_solver(chain: Chain, errors: float) -> None:
+    """From below, so that nothing is called impossible that is not."""
+    theta, C = estimated(chain, another(chain, 3, 0.2), 0.02)
+    theta = theta + errors * np.sqrt(np.diag(C)) * np.random.default_rng(5).choice([-1, 1], len(theta))
+    nearest, found = consistent_fit(chain, theta, C).distance, barrier.distance_to_robots(pose(chain, theta, C))
+    assert found <= nearest + 1e-6
+    assert found == pytest.approx(nearest, rel=0.01, abs=0.1)

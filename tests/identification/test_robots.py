@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from jaximp.identification.pipeline import Pipeline, WindowSettings
 from jaximp.identification.weighted import covariance_of
 from jaximp.models import Chain, TipImpedance, combine
 from jaximp.recordings import recording_from_arrays, recordings_from_mapping
+from jaximp.trust.verdicts import POOR
 from jaximp.types import Recording
 from paths import DATA
 
@@ -139,6 +141,48 @@ def test_parameters_have_verdicts_of_their_own(chain: Chain, pipeline: Pipeline)
     assert found.doubted["joint2.viscous_friction"][0] != ""
     assert not found.trusted_in("joint2.viscous_friction")[0]
     assert found.trusted_in("joint1.viscous_friction")[0]
+
+
+@pytest.mark.parametrize("mistake", ["order", "torques", "sign of a position", "gravity", "degrees"])
+def test_a_robot_that_cannot_be_is_not_trusted(chain: Chain, pipeline: Pipeline, tmp_path: Path, mistake: str) -> None:
+    """What users get wrong leaves a robot whose links cannot be, or that explains little."""
+    known, turned = recording(chain, 1), slice(None, None, -1)
+    recorded = {
+        "order": {"position": known.position[:, turned], "torque": known.torque[:, turned]},
+        "torques": {"torque": known.torque[:, turned]},
+        "sign of a position": {"position": known.position * [1.0, -1.0]},
+        "degrees": {"position": np.degrees(known.position)},
+    }
+    model = chain_in(tmp_path, gravity=(0.0, 0.0, 9.81)) if mistake == "gravity" else chain
+    (found,) = estimate(replace(pipeline, model=model), replace(known, **recorded.get(mistake, {})))
+    assert found.verdicts.verdict[0] == POOR
+    reason = {"degrees": "lets it move from", "gravity": "the other way round than by the masses"}
+    assert re.search(
+        reason.get(mistake, "parameters of a robot|the model explains|the other way round"), found.verdicts.reason[0]
+    )
+
+
+def test_a_robot_that_can_be_is_trusted(runs: list[Estimates]) -> None:
+    assert all(one.verdicts.trusted.all() for one in runs)
+    assert {one.measured[0].unreal for one in runs} == {0.0}
+    assert all(one.measured[0].of_robot for one in runs)
+
+
+def test_a_held_out_recording_of_something_else_is_noticed(chain: Chain, pipeline: Pipeline) -> None:
+    """Twice the load on the shoulder: the fit itself is good."""
+    other = recording(chain, 3)
+    (found,) = estimate(pipeline, recording(chain, 2), held_out=replace(other, torque=other.torque * [2.5, 1.0]))
+    assert found.verdicts.verdict[0] == POOR
+    assert "of the squared torque of the held-out recording" in found.verdicts.reason[0]
+
+
+def test_a_position_a_little_out_of_reach_is_said(chain: Chain, pipeline: Pipeline) -> None:
+    """Limits of URDFs are often set too narrowly: that alone refuses nothing."""
+    known = recording(chain, 1)
+    moved = replace(known, position=known.position + np.array([2.5, 0.0]))
+    (found,) = estimate(pipeline, moved)
+    assert any("shoulder was recorded at" in note and "to 2.5 only" in note for note in found.notes)
+    assert "lets it move" not in found.verdicts.reason[0]
 
 
 def test_windows_of_a_length_slide_over_a_chain(chain: Chain) -> None:

@@ -17,8 +17,8 @@ PACKAGE = ROOT / "jaximp"
 TESTS = ROOT / "tests"
 
 PACKAGES = (
-    "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "trust",
-    "identification", "perturbation", "posterior", "consistency", "design", "simulation", "jobs", "plots", "reports",
+    "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "consistency",
+    "trust", "identification", "perturbation", "posterior", "design", "simulation", "jobs", "plots", "reports",
     "batch", "papers", "cli",
 )  # fmt: skip
 """From the ground up: a package imports from those before it, and from itself."""

@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from factories.real_robots import PENDULUM, another, estimated, is_real
-from jaximp.consistency import consistent_posterior, sampling
 from jaximp.consistency.cone import pose
 from jaximp.models.spatial import from_pseudo_inertia, pseudo_inertia
+from jaximp.posterior import consistent_posterior, robots
 
 pytest.importorskip("blackjax", reason="the posterior needs blackjax: pip install 'jaximp[robots]'")
 
@@ -39,7 +39,7 @@ def test_the_density_is_that_of_the_estimate_and_the_prior() -> None:
     """Of normal errors, normal log-Cholesky parameters, and the logarithm of Rayleigh's friction."""
     theta, C = estimated(PENDULUM, PENDULUM.standard_parameters + 0.1, 0.1)
     posed = pose(PENDULUM, theta, C)
-    density = sampling._density(posed, SPREAD)
+    density = robots._density(posed, SPREAD)
     free = np.random.default_rng(0).normal(size=(5, 11)) * 0.5
     links = robots_of(free[:, :10] * WIDTHS)
     size = 40 / 3  # of friction: effort over velocity
@@ -96,6 +96,6 @@ def test_what_is_wrong_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> N
         consistent_posterior(*given, spread=0)
     with pytest.raises(ValueError, match=r"for the 4 base parameters of this chain they are \(4,\)"):
         consistent_posterior(PENDULUM, np.zeros(3), np.eye(4))
-    monkeypatch.setattr(sampling, "find_spec", lambda name: None)
+    monkeypatch.setattr(robots, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"posteriors of robots need blackjax: pip install 'jaximp\[robots\]'"):
         consistent_posterior(*given)
