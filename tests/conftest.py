@@ -31,6 +31,7 @@ MANY_MAPS = 20_000
 
 def pytest_configure(config: pytest.Config) -> None:
     """What takes long to compile is compiled once: for all workers, and for all processes that tests start."""
+    gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, few of them garbage
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         config.stash[STORE] = Path(tempfile.mkdtemp(prefix="jaximp-tests-"))
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.stash[STORE])
@@ -43,12 +44,13 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What most tests compile they run once: without XLA's optimisations that takes half as long.
 
-    Tests that compute for long (`slow`) and those of equal bits (`optimised`) run what users run. With
-    JAX_DISABLE_MOST_OPTIMIZATIONS=0 all do.
+    Tests that compute for long (`slow`) and those of equal bits (`optimised`) run what users run; slow ones that
+    mostly compile (`compiles`) do not. With JAX_DISABLE_MOST_OPTIMIZATIONS=0 all do.
     """
     if CHOSEN:
         return
-    quick = not any(item.get_closest_marker(name) for name in ("slow", "optimised"))
+    marked = {marker.name for marker in item.iter_markers()}
+    quick = "optimised" not in marked and ("slow" not in marked or "compiles" in marked)
     if item.get_closest_marker("optimised") and jax.config.read("jax_disable_most_optimizations"):
         jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", quick)

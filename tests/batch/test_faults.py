@@ -263,6 +263,8 @@ def test_another_job_or_another_content_is_computed_again(study: Path, tmp_path:
     assert run(folder, tmp_path / "out", resume=True).skipped == 0
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text("time_s,position_rad,torque_Nm\n0,1,x\n")
     (tmp_path / "cut.parquet").write_bytes(b"PAR1")

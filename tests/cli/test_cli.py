@@ -52,6 +52,8 @@ def run(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
     return call
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_identify_writes_everything(run, job: Path) -> None:  # type: ignore[no-untyped-def]
     out = job.parent / "out"
     status, said, _ = run("identify", job, "--out", out)

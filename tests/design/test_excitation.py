@@ -20,6 +20,8 @@ from jaximp.models import HumanJoint, Joints, Model, RobotJoint
 from jaximp.motion.trajectories import FourierSeries, jerk
 from jaximp.numerics.optimise import METHODS, minimise, onto_polytope
 
+pytestmark = pytest.mark.compiles
+
 Numbers = NDArray[np.float64]
 HUMAN, ROBOT = HumanJoint(offset=False), RobotJoint(gear_ratio=15)
 HANDLE = Limits(position=(-10.5, 10.5))

@@ -12,6 +12,8 @@ from jaximp.jobs.run import check, identify_recording
 from jaximp.recordings.load import recording_from_arrays
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_clean_recording_is_found_clean_and_its_proposal_works() -> None:
     job, recording = parse_job(JOB), joint()
     findings, proposal = check(job, recording)

@@ -24,6 +24,8 @@ def held(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
     return ((low <= truth) & (truth <= high)).mean(axis=0)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_steady_change_inside_windows_is_no_bias(ankles: ModuleType) -> None:
     """The stiffness changes by up to a third in every window; intervals are for its mean over each."""
     pipeline, found, without = ankles.pipeline(250.0), [], []

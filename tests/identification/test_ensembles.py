@@ -121,6 +121,8 @@ def drifting(position_cutoff: float = 20.0, noise: str = "estimated") -> Estimat
     ]
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_beside_a_slow_drift_noise_of_the_position_is_named_and_the_remedy_helps() -> None:
     """Frequencies without drift count more, where the encoder's noise builds the columns. The bias of inertia and
     stiffness is taken off as far as it is known; the reason names the noise, and a lower cut-off of the position needs

@@ -355,6 +355,8 @@ def test_gain_and_delay_scatter_as_their_standard_errors_say() -> None:
     np.testing.assert_allclose(with_gain(model, W) @ other, W @ theta)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_threshold_for_fake_changes_knows_the_past_of_a_period() -> None:
     job = parse_job(f"reference_period = {PERIOD}\n{JOB}")
     recording = joint()
@@ -422,6 +424,8 @@ def test_parameters_that_are_named_are_judged() -> None:
     assert any("reflex_160ms" in reason for reason in found.reason)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_ankle_with_a_reflex_is_explained_by_one(data_folder: Path) -> None:
     reflexes = ("true", "{ direction = -1 }")
     human = "{{ offset = false, reflex = {} }}"

@@ -19,6 +19,8 @@ from jaximp.least_squares.chunks import lags_for_sums
 from jaximp.least_squares.sliding import adaptive_least_squares, sliding_least_squares, sliding_pieces, sliding_theta
 from jaximp.least_squares.window import SlidingFit, confidence_interval
 
+pytestmark = pytest.mark.compiles
+
 Numbers = NDArray[np.float64]
 
 

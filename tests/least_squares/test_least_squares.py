@@ -313,6 +313,8 @@ def test_variance_accounted_for_earns_nothing_with_a_constant() -> None:
     assert float(variance_accounted_for(y, 2 * y, weight)) == pytest.approx(-3)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_gradient_through_the_fit_is_finite_difference() -> None:
     W, y = regression(30, 4)
     direction, lags, step = np.random.default_rng(3).normal(size=W.shape), 0.5 ** np.arange(5.0), 1e-6

@@ -202,6 +202,8 @@ def test_rest_holds_what_was_known(position_noise: float) -> None:
     np.testing.assert_array_equal(renewed[3:600], np.arange(3, 600))
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_streamed_steps_are_the_scan_also_at_rest_and_over_gaps() -> None:
     W, y = rest(0, n=600)
     W[[20, 130], 1] = np.nan
@@ -227,6 +229,8 @@ def test_what_is_not_finite_is_skipped() -> None:
     assert (np.asarray(fit.renewed)[30:60] == 29).all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.optimised
 def test_intervals_hold_the_truth_in_95_percent() -> None:
     """In motion, as the memory fills, and held through rests: 800 times ten memories of motion and fifteen of rest."""

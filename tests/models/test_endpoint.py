@@ -73,6 +73,8 @@ def test_ellipse_of_an_indefinite_matrix_has_the_sizes_of_its_eigenvalues() -> N
     np.testing.assert_allclose([found.major, found.minor, found.orientation], [5, 2, np.pi / 2])
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_standard_errors_of_an_ellipse_are_those_of_many_draws() -> None:
     theta = np.array([29.0, 13.0, 17.0])
     factor = np.array([[0.3, 0, 0], [0.1, 0.2, 0], [-0.1, 0.1, 0.2]])

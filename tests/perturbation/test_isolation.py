@@ -65,6 +65,8 @@ def test_true_stiffness_is_the_paper_s(experiment: Experiment) -> None:
     np.testing.assert_allclose(experiment.stiffness.mean(axis=0), [29.05, 14.37, 17.08], rtol=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_inertia_comes_from_the_static_task(experiment: Experiment) -> None:
     assert experiment.postures is not None
     found = static_inertia(experiment.postures, ARM.geometry)

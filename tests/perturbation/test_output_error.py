@@ -103,6 +103,8 @@ def without_noise(theta: np.ndarray, trials: Simulated) -> Trials:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_an_impedance_without_noise_is_given_back(trials: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
     theta = THETA.copy()
     theta[module.PLACES.delay], theta[module.PLACES.inertia] = 0.0, ARM.inertia
@@ -121,6 +123,8 @@ def test_an_impedance_without_noise_is_given_back(trials: Simulated, monkeypatch
     assert abs(fit.delay) < 1e-8
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_deviation_is_that_of_the_twins(trials: Simulated, fit: OutputErrorFit) -> None:
     """To what the trials' own impedance differs from their mean: within 1 % in position, and zero at the onset."""
     rows = np.arange(PERTURBED)[:, None], np.asarray(trials.twins.onset)[:, None] + np.arange(461)
@@ -148,6 +152,8 @@ def test_the_impedance_is_found(trials: Simulated, fit: OutputErrorFit) -> None:
         assert (of_D < 0.15 * K.max() / 12).all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_steep_course_may_bend(trials: Simulated, fit: OutputErrorFit, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a movement of 1 s K11 changes by 70 %, unevenly: a straight course finds it too small, and too surely."""
     monkeypatch.setattr(module, "BEND", 1e-9)

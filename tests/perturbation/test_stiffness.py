@@ -102,6 +102,8 @@ def test_minimum_is_that_of_scipy_on_all_samples() -> None:
     assert fit.samples == torque.size // 2
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 @every_damping
 def test_exact_data_are_recovered(damping: str) -> None:
     displacement, velocity, torque = trials(2, 6, noise=0.0)
@@ -160,6 +162,8 @@ def test_triangle_is_accurate_in_every_unit_and_for_columns_that_depend_on_each_
     assert (np.tril(R, -1) == 0).all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_indefinite_data_end_on_the_boundary() -> None:
     displacement, velocity, torque = trials(1, 6, np.array([[29.0, 0.0], [0.0, -5.0]]), noise=0.01)
     fit = jaximp.fit_stiffness(displacement[0], velocity[0], torque[0])

@@ -79,6 +79,8 @@ def rows_of(position: Any, force: Any) -> Any:
     return regress_trials(ARM, joint_trials(QUIET.geometry, position, force, 150, RATE), FILTER)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_robot_feels_what_the_arm_is() -> None:
     """Noise-free: the torque is the regressor times the truth, and the hand's force does its work."""
     clean = hold(QUIET, DIRECTIONS, 0.2, TIME)
@@ -240,6 +242,8 @@ def moved(recording: Recording, by: float, straight: bool = False) -> Recording:
     return replace(recording, position=position)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.usefixtures("unchecked")
 def test_too_little_data_is_refused(held: HeldTrials) -> None:
     def rows(amplitudes: np.ndarray, samples: slice) -> Any:

@@ -310,6 +310,8 @@ def test_what_needs_numbers_says_so(
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_what_a_window_must_reach_may_be_an_argument_of_compiled_code() -> None:
     fit = small_chunks(lambda stderr: jaximp.adaptive_least_squares(W, Y, stderr, 8, 12, step=4).theta)
     wanted = np.full(2, 0.05)

@@ -318,6 +318,8 @@ def click(page: Browser, time: float) -> None:
     mouse(page, "mouseReleased", x, y, button="left", clickCount=1)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_figures_are_drawn_when_somebody_comes_near(page: Browser) -> None:
     assert page.evaluate(f"{CANVASES % 'condition'}.length") == 0
     near(page, "condition")

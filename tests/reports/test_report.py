@@ -135,6 +135,8 @@ def test_table_has_columns_units_and_the_job(folder: Path, case: tuple[Job, Reco
     assert table["verdict"].to_pylist() == estimates.verdicts.verdict.tolist()
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_no_trusted_window_is_said_before_any_number(case: tuple[Job, Recording, Estimates], tmp_path: Path) -> None:
     job, source, estimates = case
     report.write_results(tmp_path, [without_trust(estimates)], [], job, source)
@@ -195,6 +197,8 @@ def test_the_report_says_whether_estimates_depend_on_the_frequency(folder: Path)
     )
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_windows_that_do_not_predict_the_next_are_counted(
     case: tuple[Job, Recording, Estimates], tmp_path: Path
 ) -> None:
@@ -206,6 +210,8 @@ def test_windows_that_do_not_predict_the_next_are_counted(
     assert "Of these windows 3 predict the torque of the next one worse than a constant would." in page
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_parameter_that_is_not_determined_is_said_in_the_table(
     case: tuple[Job, Recording, Estimates], tmp_path: Path
 ) -> None:

@@ -162,6 +162,8 @@ def test_measurements_are_quantised_and_noisy() -> None:
     assert abs(noise.mean()) < 4 * 5e-4 / 100
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_keys_in_a_batch_equal_a_loop() -> None:
     def torque(key: jax.Array) -> jax.Array:
         return simulate_rig(Rig(), ROBOT_TRAJECTORY, 10.0, key=key).torque
@@ -170,6 +172,8 @@ def test_keys_in_a_batch_equal_a_loop() -> None:
     np.testing.assert_allclose(jax.vmap(torque)(keys), jnp.stack([torque(key) for key in keys]), atol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_humans_and_references_in_a_batch_equal_a_loop() -> None:
     def motion(stiffness: jax.Array, scale: jax.Array) -> RigMotion:
         reference = eqx.tree_at(lambda s: s.sine, ROBOT_TRAJECTORY, scale * ROBOT_TRAJECTORY.sine)
@@ -184,6 +188,8 @@ def test_humans_and_references_in_a_batch_equal_a_loop() -> None:
         np.testing.assert_allclose(batch.human_torque[i], one.human_torque, atol=2e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_step_with_and_without_jit() -> None:
     rig, human, point = Rig(), HumanLoad(inertia=1e-6), setpoint(0.3)
     plain = step(rig, human, init(rig, human, point), point)

@@ -58,6 +58,8 @@ def test_lines_are_the_means_over_windows() -> None:
     np.testing.assert_allclose(bands.ordinary, mean(filtered), rtol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize(
     ("every", "changes", "uneven"),
     [(1, 0.0, False), (1, 0.5, False), (2, 0.0, False), (1, 0.0, True)],

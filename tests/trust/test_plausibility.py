@@ -60,6 +60,8 @@ def joint(factor: float) -> Recording:
     return recording_from_arrays(t, factor * q + 1e-5 * random.normal(size=len(t)), torque)
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_windows_are_judged_by_the_joint_that_is_named() -> None:
     in_degrees = joint(180 / np.pi)
 

@@ -114,6 +114,8 @@ def test_without_forgetting_nothing_is_out_of_date() -> None:
     assert judge_recursive(fit, MODEL, W, y, 1.0).trusted[100:].all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_limits_are_those_of_windows() -> None:
     W, y = record()
     verdicts = judged(W, y, limits=TrustLimits(max_relative_stderr=1e-4))[1]
