@@ -99,7 +99,8 @@ class Clearance(eqx.Module):
         **Arguments:**
 
         - `urdf`: the file whose boxes, cylinders and spheres (`<collision>`, else `<visual>`) are the shapes. Without
-          it, and for links with meshes, a capsule goes from the link's origin to the joints that it bears.
+          it, and for links with meshes, capsules go from the link's origin to the joints that it bears: to fixed and
+          locked ones, too, so that a gripper and its fingers are covered whatever the chain's tip.
         - `distance` between surfaces [m]; `radii` [m] by the name of the link, for links whose capsules go from joint
           to joint, whatever the file says of their shape; `radius` of all other links without a shape.
         - `planes` that all that moves stays over; `ignore` pairs of links that may touch.
@@ -233,17 +234,18 @@ def _capsules(
     shapes = {} if urdf is None else _shapes(urdf)
     found: list[Capsule] = []
     assumed = []
-    of_body = {-1: next(iter(chain.frames)), **{k: links[0] for k, links in enumerate(chain.link_names)}}
+    own_of = {next(iter(chain.frames)), *(links[0] for links in chain.link_names)}
     for link, at in chain.frames.items():
-        given = [] if link in radii else shapes.get(link, [])
-        own = radii.get(link, radius)
-        if given:
-            found += [Capsule(link, at.body, ends @ at.rotation.T + at.position, size) for ends, size in given]
-        elif of_body[at.body] == link:
-            found += [Capsule(link, at.body, ends, own) for ends in _to_joints(chain, at.body)]
+        # Without a file nobody knows what stands around the robot, but what moves is covered.
+        shape = shapes.get(link, [] if at.body < 0 else None)
+        if shape and link not in radii:
+            found += [Capsule(link, at.body, ends @ at.rotation.T + at.position, size) for ends, size in shape]
+            continue
+        bars = _to_joints(chain, link)
+        if bars or shape is None or link in own_of or link in radii:
+            point = np.stack([at.position] * 2)
+            found += [Capsule(link, at.body, ends, radii.get(link, radius)) for ends in bars or [point]]
             assumed += [link] * (link not in radii)
-        elif link in radii:
-            found.append(Capsule(link, at.body, np.stack([at.position] * 2), own))
     if not assumed:
         return found, ()
     return found, (
@@ -251,24 +253,36 @@ def _capsules(
     )
 
 
-def _to_joints(chain: Chain, body: int) -> list[Numbers]:
-    """Segments (2, 3) from a body's origin to the joints that it bears, or to its tip."""
-    tree = chain.tree
-    far = [np.asarray(tree.position[k]) for k, parent in enumerate(tree.parents) if parent == body]
-    if chain.tip is not None and tree.tip_body == body:
-        far.append(np.asarray(tree.tip_position))
-    return [np.stack([np.zeros(3), end]) for end in far or [np.zeros(3)]]
+def _to_joints(chain: Chain, link: str) -> list[Numbers]:
+    """Segments (2, 3) in the frame of a link's body, from the link's origin to the joints that it bears: fixed ones,
+    too, if it moves. The first link of the base reaches to all joints of the base."""
+    frames, tree = chain.frames, chain.tree
+    at, root = frames[link], next(iter(frames))
+    bears = [
+        below.position if below.body == at.body else np.asarray(tree.position[below.body])
+        for below in frames.values()
+        if below.parent == link and (at.body >= 0 or below.body >= 0)
+    ]
+    if link == root:
+        bears = [np.asarray(tree.position[k]) for k, parent in enumerate(tree.parents) if parent < 0]
+    return [np.stack([at.position, end]) for end in bears if (end != at.position).any()]
 
 
-def _shapes(path: Path) -> dict[str, list[tuple[Numbers, float]]]:
-    """Segments (2, 3) in the link's frame, with their radii, of each link's boxes, cylinders and spheres."""
-    found = {}
+def _shapes(path: Path) -> dict[str, list[tuple[Numbers, float]] | None]:
+    """Segments (2, 3) in the link's frame, with their radii, of each link's boxes, cylinders and spheres.
+
+    None for a body whose shape cannot be read, as that of a mesh; an empty list for a link that is only a frame.
+    """
+    found: dict[str, list[tuple[Numbers, float]] | None] = {}
     for link in root_of(text_of(path), str(path)).findall("link"):
+        name = str(link.get("name"))
+        found[name] = [] if link.find("inertial") is None else None
         for kind in ("collision", "visual"):
-            where = f"{path}: a {kind} of link '{link.get('name')}'"
-            each = [_capsule(element, where) for element in link.findall(kind)]
-            if each and None not in each:  # nobody knows what a mesh beside a box covers
-                found[str(link.get("name"))] = [capsule for capsule in each if capsule is not None]
+            each = [_capsule(element, f"{path}: a {kind} of link '{name}'") for element in link.findall(kind)]
+            known = [capsule for capsule in each if capsule is not None]
+            if each:  # nobody knows what a mesh beside a box covers
+                found[name] = known if len(known) == len(each) else None
+            if found[name]:
                 break
     return found
 

@@ -117,7 +117,7 @@ class Chain(Model):
     offset: bool = eqx.field(static=True)
     _limits: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     _leaders: tuple[int, ...] = eqx.field(static=True)
-    _frames: tuple[tuple[str, int, tuple[float, ...], tuple[float, ...]], ...] = eqx.field(static=True)
+    _frames: tuple[tuple[str, int, tuple[float, ...], tuple[float, ...], str], ...] = eqx.field(static=True)
     _digest: str = eqx.field(static=True)
 
     def __init__(
@@ -151,7 +151,7 @@ class Chain(Model):
         self._limits = tuple(tuple(getattr(joint.limits, key) for joint in leaders) for key in JointLimits._fields)
         self._leaders = tuple(k for k, body in enumerate(found.bodies) if body.joint.mimic is None)
         self._frames = tuple(
-            (link, at.body, tuple(at.rotation.ravel().tolist()), tuple(at.position.tolist()))
+            (link, at.body, tuple(at.rotation.ravel().tolist()), tuple(at.position.tolist()), at.parent)
             for link, at in found.frames.items()
         )
         self.terms, self.rotor, self.offset = friction_terms(friction), rotor, offset
@@ -267,8 +267,8 @@ class Chain(Model):
     def frames(self) -> dict[str, Frame]:
         """Where each of the URDF's links is fixed: to which body (-1 for the base), how turned and where."""
         return {
-            link: Frame(body, np.reshape(rotation, (3, 3)), np.array(position))
-            for link, body, rotation, position in self._frames
+            link: Frame(body, np.reshape(rotation, (3, 3)), np.array(position), parent)
+            for link, body, rotation, position, parent in self._frames
         }
 
     def smoothed(self, width: Num[ArrayLike, "*n"]) -> Model:

@@ -109,6 +109,8 @@ class Frame:
     """-1 for the base."""
     rotation: Numbers
     position: Numbers
+    parent: str = ""
+    """The link that it hangs on; none for the base."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +178,7 @@ def moving_bodies(
         inertia = urdf.links[joint.child]
         if joint.kind == "fixed" or joint.name in held:
             R, p = _displaced(joint, held.get(joint.name, 0.0), R, p)
-            at[joint.child] = Frame(below.body, R, p)
+            at[joint.child] = Frame(below.body, R, p, joint.parent)
             if below.body >= 0:
                 lump = bodies[below.body]
                 more = 0.0 if inertia is None else moved(inertia, R, p)
@@ -189,7 +191,7 @@ def moving_bodies(
                 f"lock it with locked={{'{joint.name}': 0}}, or start above it with base='{joint.child}'"
             )
         limits = _checked_limits(urdf.source, joint, strict)
-        at[joint.child] = Frame(len(bodies), np.eye(3), np.zeros(3))
+        at[joint.child] = Frame(len(bodies), np.eye(3), np.zeros(3), joint.parent)
         own = np.zeros(10) if inertia is None else inertia
         bodies.append(Body(replace(joint, limits=limits), below.body, R, p, own, (joint.child,)))
     _check_bodies(urdf, bodies, base, strict)

@@ -162,3 +162,31 @@ def test_a_shape_without_numbers_is_refused(tmp_path: Path) -> None:
     path.write_text(with_shape('<sphere radius="big"/>'), encoding="utf-8")
     with pytest.raises(ValueError, match="a collision of link 'two' has radius='big': it must be 1 finite"):
         Clearance.of(Chain.from_urdf(path), path)
+
+
+GRIPPER = robot(
+    link("ground"), joint("a", "ground", "arm", axis="0 1 0"), link("arm"), joint("b", "arm", "wrist", axis="0 1 0"),
+    link("wrist"), joint("mount", "wrist", "palm", "fixed", "0 0 0.1"),
+    link("palm").replace("</link>", '<visual><geometry><mesh filename="palm.stl"/></geometry></visual></link>'),
+    joint("grip", "palm", "finger", "prismatic", "0 0.05 0.1", axis="0 1 0"), link("finger"),
+    joint("point", "palm", "centre", "fixed", "0 0 0.25"), '<link name="centre"/>',
+)  # fmt: skip
+"""A palm with a finger that is locked, and the point between the fingers, behind the link that the last joint moves."""
+
+
+@pytest.mark.parametrize("tip", [None, "centre"])
+@pytest.mark.parametrize("known", [True, False])
+def test_what_hangs_on_the_last_link_is_covered_whatever_the_tip(tmp_path: Path, known: bool, tip: str | None) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(GRIPPER, encoding="utf-8")
+    chain = Chain.from_urdf(path, tip=tip, locked={"grip": 0.03})
+    clearance = Clearance.of(chain, path if known else None, radius=0.01, planes=[Plane(offset=-0.2)])
+    q = np.random.default_rng(0).uniform(-3, 3, (20, 2))
+    reach = {"palm": [0, 0, 0.1], "finger": [0, 0.08, 0.2], "centre": [0, 0, 0.35]}
+    heights = [[p + R @ point for point in reach.values()] for R, p in (bodies(chain, pose)[1] for pose in q)]
+    lowest = np.array(heights)[:, :, 2].min(axis=1)
+    over = np.array([name.endswith(" and table") for name in clearance.names])
+    found = np.asarray(clearance.distances(q))[:, over].min(axis=1)
+    assert (found <= lowest + 0.2 - 0.01 + 1e-12).all()
+    assert "ground, arm, wrist, palm" in clearance.notes[0]
+    assert "finger" in clearance.notes[0]
