@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 
@@ -11,10 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Num
 
 from jaximp.models.chain import Chain
-from jaximp.models.spatial import about, pseudo_inertia
-from jaximp.models.urdf import read_urdf
+from jaximp.models.spatial import about, moved, pseudo_inertia
+from jaximp.models.urdf import Urdf, read_urdf
 from jaximp.results import Column
 from jaximp.types import AnyArray, Numbers, listed
+
+MOST_BEHIND = 0.9
+"""Links behind locked joints keep no more than this of the sum that they are part of, in any of its moments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +58,10 @@ def export_urdf(
 
     Everything that moves together has one inertia in a chain. It is written to the link that the joint moves; links
     that are fixed to it lose their `<inertial>`, as they are in the sum. (To share it out again would take guesses, and
-    the rest could be no real body.) Where joints are locked, the sum is that of their position. Friction and rotors'
-    inertias are not written. A comment at the head of the file says which numbers the data determined.
+    the rest could be no real body.) Links behind locked joints keep theirs, as what can move needs one, and the link
+    that bears them has the rest of the sum at the locked position: so the file can be read without locking anything.
+    Where the rest would be no real body, they keep the largest share that leaves one. Friction and rotors' inertias are
+    not written. A comment at the head of the file says which numbers the data determined.
 
     **Arguments:** `source` the URDF that the chain was made of; `standard` parameters as of `consistent_fit`; which of
     them the data `determined`, such as `consistent_ranges(...).determined`; `out` the file to write.
@@ -78,9 +84,8 @@ def export_urdf(
     if out.resolve() == source.resolve():
         raise ValueError(f"{out} is the original: give another file")
     links = standard[: 10 * chain.tree.n_bodies].reshape(-1, 10)
-    inertials: dict[str, str] = {}
-    for k, (names, link) in enumerate(zip(chain.link_names, links, strict=True)):
-        inertials |= dict.fromkeys(names, "") | {names[0]: _inertial(k, link)}
+    lumps = [_lump(urdf, chain, k, link) for k, link in enumerate(links)]
+    inertials = {name: element for lump in lumps for name, element in lump.inertials.items()}
     marks = ["data" if mark else "prior" for mark in determined[: links.size]] + ["not written"] * (P - links.size)
     found = Exported(
         out,
@@ -93,17 +98,51 @@ def export_urdf(
     # The decoded text, so that places count in its own bytes.
     text = source.read_text(encoding="utf-8-sig").encode("utf-8")
     try:
-        out.write_bytes(_replaced(text, inertials, _comment(chain, found)))
+        out.write_bytes(_replaced(text, inertials, _comment(found, lumps)))
     except OSError as error:
         raise ValueError(f"{out} cannot be written: {error.strerror or error}; choose another place") from None
     return found
 
 
-def _inertial(k: int, link: Numbers) -> str:
-    """The element of a link about its centre of mass, in the axes of its frame."""
-    if not np.isfinite(link).all() or not np.linalg.eigvalsh(pseudo_inertia(link))[0] > 0:
+class _Lump(NamedTuple):
+    """What moves together, and how it is shared out over its links."""
+
+    fixed: tuple[str, ...]
+    """The link that the joint moves, and those that are fixed to it."""
+    held: tuple[str, ...]
+    """Links behind locked joints."""
+    share: float
+    """That they keep of their inertia."""
+    inertials: dict[str, str]
+    """The new element of each link that changes; empty for none."""
+
+
+def _lump(urdf: Urdf, chain: Chain, k: int, total: Numbers) -> _Lump:
+    names, frames = chain.link_names[k], chain.frames
+    kinds = {joint.child: joint.kind for joint in urdf.joints}
+    held: list[str] = []
+    for name in names[1:]:  # parents before children
+        if kinds[name] != "fixed" or frames[name].parent in held:
+            held.append(name)
+    own = {name: inertia for name in held if (inertia := urdf.links[name]) is not None}
+    behind = sum((moved(x, frames[name].rotation, frames[name].position) for name, x in own.items()), np.zeros(10))
+    whole = pseudo_inertia(total)
+    if not np.isfinite(total).all() or not np.linalg.eigvalsh(whole)[0] > 0:
         raise ValueError(f"link{k + 1} is no real body: find the nearest robot that can be with consistent_fit")
-    mass, centre = link[0], link[1:4] / link[0]
+    # The rest is a real body as long as no combination of moments needs more than the whole has.
+    most = float(np.linalg.eigvals(np.linalg.solve(whole, pseudo_inertia(behind))).real.max())
+    share = min(1.0, MOST_BEHIND / most) if most > 0 else 1.0
+    fixed = tuple(name for name in names if name not in held)
+    inertials = dict.fromkeys(fixed, "") | {names[0]: _inertial(total - share * behind)}
+    if share < 1:
+        inertials |= {name: _inertial(share * x) for name, x in own.items()}
+    return _Lump(fixed, tuple(held), share, inertials)
+
+
+def _inertial(link: Numbers) -> str:
+    """The element of a link about its centre of mass, in the axes of its frame."""
+    mass = link[0]
+    centre = link[1:4] / mass if mass > 0 else np.zeros(3)
     xx, xy, yy, xz, yz, zz = (link - about(mass, centre, np.zeros((3, 3))))[4:]
     numbers = {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
     inertia = " ".join(f'{key}="{value:.15g}"' for key, value in numbers.items())
@@ -113,18 +152,23 @@ def _inertial(k: int, link: Numbers) -> str:
     )
 
 
-def _comment(chain: Chain, found: Exported) -> bytes:
+def _comment(found: Exported, lumps: list[_Lump]) -> bytes:
     """Which numbers the data determined, link by link."""
     lines = [
         "Inertial parameters by jaximp, about the origin of each link's frame. Determined by data, or kept from the"
     ]
     lines.append("original file (prior) as far as a real body with the same torques can keep them:")
-    for k, names in enumerate(chain.link_names):
+    for k, lump in enumerate(lumps):
         at = range(10 * k, 10 * k + 10)
         by = {mark: [found.names[j].split(".")[1] for j in at if found.source[j] == mark] for mark in ("data", "prior")}
-        lump = f" (with {listed(names[1:])}, whose inertial is in this sum)" if len(names) > 1 else ""
+        also = [f"{listed(lump.fixed[1:])}, whose inertial is in this sum"] if lump.fixed[1:] else []
+        if lump.held:
+            kept = "the inertial" if lump.share == 1 else f"{lump.share:.0%} of the inertial"
+            also.append(f"{listed(lump.held)} behind locked joints, which keep {kept} of the original file")
+        about_it = f" (with {', and '.join(also)})" if also else ""
         lines.append(
-            f"{names[0]}{lump}: data {', '.join(by['data']) or 'none'}; prior {', '.join(by['prior']) or 'none'}"
+            f"{lump.fixed[0]}{about_it}: data {', '.join(by['data']) or 'none'}; "
+            f"prior {', '.join(by['prior']) or 'none'}"
         )
     # Two hyphens would end a comment too early.
     text = "\n  ".join(lines).replace("--", "- -")

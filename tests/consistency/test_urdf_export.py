@@ -14,6 +14,7 @@ from factories.robots import TREE, joint, link, robot
 from jaximp.consistency import export_urdf
 from jaximp.models import rigid_body
 from jaximp.models.chain import Chain
+from jaximp.models.spatial import pseudo_inertia
 from jaximp.models.urdf import SIX_JOINT_ARM
 
 MESH = '<visual><geometry><mesh filename="package://a>b/hand.stl"/></geometry></visual><!-- a comment -->'
@@ -75,6 +76,45 @@ def test_links_that_are_fixed_to_another_are_in_its_sum(tmp_path: Path) -> None:
     written = out.read_text(encoding="utf-8")
     assert written.count("<inertial>") == SIX_JOINT_ARM.read_text(encoding="utf-8").count("<inertial>") - 1
     assert "flange (with tool, whose inertial is in this sum): data none; prior mass, mc_x," in written
+
+
+HAND = robot(
+    "<link name='base' />",
+    joint("turn", "base", "arm", axis="0 1 0"),
+    link("arm", 2.0, inertia="0.02 0 0 0.025 0 0.015"),
+    joint("mount", "arm", "palm", "fixed", "0.1 0 0.3", "0.2 0.1 0"),
+    link("palm", 0.5, inertia="0.002 0 0 0.0025 0 0.0015"),
+    joint("grip", "palm", "finger", "prismatic", "0 0 0.1", axis="0 1 0"),
+    link("finger", 0.2, inertia="0.002 0 0 0.0025 0 0.0015"),
+    joint("pad_mount", "finger", "pad", "fixed", "0 0 0.05"),
+    link("pad", 0.1, inertia="0.0002 0 0 0.00025 0 0.00015"),
+    joint(
+        "follow", "palm", "thumb", "prismatic", "0 0 0.1", axis="0 1 0", more='<mimic joint="grip" multiplier="-1"/>'
+    ),
+    link("thumb", 0.2, inertia="0.002 0 0 0.0025 0 0.0015"),
+)
+"""A hand whose finger and thumb are locked."""
+
+
+@pytest.mark.parametrize("lighter", [1.0, 0.2])
+def test_the_file_can_be_read_without_locking_what_was_locked(lighter: float, tmp_path: Path) -> None:
+    """And at the locked position it moves as before; where the whole is lighter than its fingers, these give way."""
+    source, out = tmp_path / "own.urdf", tmp_path / "identified.urdf"
+    source.write_text(HAND, encoding="utf-8")
+    chain = Chain.from_urdf(source, locked={"grip": 0.02})
+    standard = lighter * np.array(chain.standard_parameters)
+    export_urdf(source, chain, standard, np.zeros(10, bool), out)
+
+    free = Chain.from_urdf(out)
+    assert free.joint_names == ("turn", "grip")
+    q, dq, ddq = np.random.default_rng(0).normal(size=(3, 7, 1))
+    torque = rigid_body.inverse_dynamics(chain.tree, standard.reshape(-1, 10), q, dq, ddq)
+    motion = (np.concatenate([x, np.full((7, 1), held)], axis=1) for x, held in ((q, 0.02), (dq, 0), (ddq, 0)))
+    np.testing.assert_allclose(free.inverse_dynamics(*motion)[:, :1], torque, rtol=0, atol=1e-12)
+    assert all(np.linalg.eigvalsh(pseudo_inertia(one))[0] > 0 for one in free.links)
+    written = out.read_text(encoding="utf-8")
+    assert ('mass value="0.1"' in written) == (lighter == 1)
+    assert "(with palm, whose inertial is in this sum, and finger, pad and thumb behind locked joints, which" in written
 
 
 @pytest.mark.usefixtures("unchecked")
