@@ -63,6 +63,18 @@ def identify_into(job: Job, folder: Path) -> None:
         typer.echo(line)
 
 
+def _how_loose(estimates: Estimates, share: float) -> str:
+    """Of a parameter, by the share that `Estimates.undetermined` gives."""
+    from jaximp.models.chain import Chain
+
+    if not math.isfinite(share):
+        return ""
+    if isinstance(estimates.model, Chain):
+        return f": half of its interval is {share:.0%} of its size"
+    times = f"{share:.0%} of it" if share < 1 else f"{share:.2g} times as large"
+    return f": its standard error in one window is {times}"
+
+
 def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
     from jaximp.jobs.run_trials import identify_trials
 
@@ -104,8 +116,7 @@ def _say_result(estimates: Estimates) -> None:
         if name in shown.changed and math.isfinite(mean):
             said = f"{'not one value':>13}: {shown.changed[name]}"
         elif name in loose:
-            times = f"{loose[name]:.0%} of it" if loose[name] < 1 else f"{loose[name]:.2g} times as large"
-            said += f", not determined: its standard error in one window is {times}"
+            said += f", not determined{_how_loose(shown, loose[name])}"
         typer.echo(f"{name:>{width}} {said}")
 
 

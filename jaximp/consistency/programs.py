@@ -16,20 +16,17 @@ from jaxtyping import Num
 
 from jaximp.consistency.cone import BASIS, Posed, pose
 from jaximp.models.chain import Chain
+from jaximp.models.spatial import NEVER_NEGATIVE
 from jaximp.results import Column, Result
+from jaximp.trust.determined import determined, sizes_of_chain
 from jaximp.types import AnyArray, Numbers, Progress, nearest
 
 MARGIN = 1e-4
 """Smallest eigenvalue of a link's matrix, as a share of the URDF's: a hundredth of its width."""
 WEAK = 1e-3
 """What a link costs that differs from the URDF's by its own size, in squared standard errors."""
-DETERMINED = 0.25
-"""Half of an interval, as a share of its middle (or of the parameter's natural size, where it has a sign), below which
-the data determine a parameter."""
-
 NOTHING = 1e-6
 """Share of a parameter's natural size below which an end of its range is zero, up to the solver's errors."""
-NEVER_NEGATIVE = (".mass", ".Ixx", ".Iyy", ".Izz")
 LARGE, LARGER, GROWS = 1e2, 1e4, 1.2
 """Where the solver finds no end, links are limited to so many times the URDF's moments: what grows by this factor from
 the one to the other has none."""
@@ -78,8 +75,8 @@ class Ranges:
     high: Numbers
     """(k,) largest values; inf where there is none."""
     determined: AnyArray
-    """(k,) whether the data determine the parameter: half of the interval is at most a quarter of its middle (or of the
-    URDF's size, for what has a sign)."""
+    """(k,) whether the data determine the parameter: half of the interval is at most a quarter of its middle, or for
+    first moments and products of inertia of what they can be by the URDF (`trust.determined`)."""
     level: float
     distance: float
     """Of the nearest robot from the estimate, in standard errors."""
@@ -203,18 +200,16 @@ def consistent_ranges(
     low, high = np.array(ends, float).reshape(-1, 2).T + posed.offset[index]
     natural = np.linalg.norm(cone.scale[index], axis=1)
     low, high = (np.where(abs(x) < NOTHING * natural, 0.0, x) for x in (low, high))
-    signed = ~cone.positive[index] & ~np.array([name.endswith(NEVER_NEGATIVE) for name in names], bool)
+    signed = ~cone.positive[index] & ~np.array([name.rpartition(".")[2] in NEVER_NEGATIVE for name in names], bool)
     low = np.where(signed, low, np.maximum(low, 0.0))
-    ended = np.isfinite(low) & np.isfinite(high)
-    middle = abs(np.where(ended, low, 0.0) + np.where(ended, high, 0.0)) / 2
-    determined = ended & (high - low <= 2 * DETERMINED * np.where(signed, np.maximum(middle, natural), middle))
+    known_by_data = determined(low, high, sizes_of_chain(chain, np.eye(len(known))[index]))
     units, notes = tuple(cone.units[k] for k in index), list(cone.notes)
     if distance**2 > region:
         notes.append(
             f"no real robot lies within the errors of the estimate: the nearest is {distance:.3g} standard errors "
             "away; errors are claimed too small, or the model lacks something"
         )
-    return Ranges(names, units, low, high, determined, level, distance, tuple(notes))
+    return Ranges(names, units, low, high, known_by_data, level, distance, tuple(notes))
 
 
 class _Program:

@@ -19,6 +19,7 @@ from jaximp.models.chain import Chain
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.models.tip import TipImpedance
 from jaximp.results import Column, Result
+from jaximp.trust.determined import DETERMINED, openness, sizes_of_chain
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit
@@ -279,12 +280,20 @@ class Estimates(Result):
         return np.array([column.std() if len(column) else np.nan for column in self._trusted_columns()])
 
     def undetermined(self) -> dict[str, float]:
-        """Parameters whose standard error in one window is, in the median over those that can be trusted in it, a
-        larger share of their size in all windows than `limits.max_relative_stderr`; and that share.
+        """Parameters that the data do not determine, and how far from it they are.
 
-        The rules of a window are milder: they compare with what would explain the whole torque by itself.
+        Of a robot from its URDF those by `trust.determined`, with half of their interval (the median over all windows)
+        as a share of their size. Of other models those whose standard error in one window is, in the median over those
+        that can be trusted in it, a larger share of their size in all windows than `limits.max_relative_stderr`; and
+        that share. The rules of a window are milder: they compare with what would explain the whole torque by itself.
         """
-        found = {}
+        if isinstance(self.model, Chain):
+            middle = np.array([self._size(k) for k in range(len(self.names))])
+            low, high = self.interval()
+            half = np.array([np.nan if not len(x) else np.median(x) for x in _finite_columns((high - low) / 2)])
+            open_by = openness(middle - half, middle + half, sizes_of_chain(self.model))
+            return {name: float(by) for name, by in zip(self.names, open_by, strict=True) if by > DETERMINED}
+        found: dict[str, float] = {}
         for k, name in enumerate(self.names):
             errors, size = self.stderr[self.trusted_in(name), k], self._size(k)
             share = float(np.median(errors) / size) if len(errors) and size else 0.0
@@ -302,3 +311,7 @@ class Estimates(Result):
 
     def _trusted_columns(self) -> list[NDArray[np.float64]]:
         return [self.value[self.trusted_in(name), k] for k, name in enumerate(self.names)]
+
+
+def _finite_columns(values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    return [column[np.isfinite(column)] for column in values.T]

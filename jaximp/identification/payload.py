@@ -29,6 +29,7 @@ from jaximp.models.chain import Chain
 from jaximp.models.spatial import PARAMETERS
 from jaximp.recordings.join import part_of
 from jaximp.results import Parameter
+from jaximp.trust.determined import determined, sizes_of_body
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
 LOAD_METHODS = {
@@ -37,10 +38,6 @@ LOAD_METHODS = {
     3: "the difference of the torques on the same motion",
     4: "robot and load together, from all recordings",
 }
-DETERMINED = 0.25
-"""Half of an interval, as a share of the parameter's size, up to which the recordings determine it."""
-CENTRE_KNOWN = 0.01
-"""So near [m] a centre of mass is known, wherever it is."""
 FARTHEST = 2.0
 """Seconds by which two recordings of one motion may begin apart."""
 COMPARED = 2000
@@ -87,14 +84,11 @@ class Payload(Quantities):
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(10,) which parameters the recordings determine: half of the interval is at most a quarter of the mass, of
-        the first moment (or the mass times 1 cm) and of the largest moment of inertia."""
+        """(10,) which parameters the recordings determine: half of the interval is at most a quarter of the parameter,
+        or for first moments and products of inertia of what they can be (`trust.determined`)."""
         low, high = self.interval()
-        mass, moment, inertia = self.theta[0], self.theta[1:4], self.theta[[4, 6, 9]]
-        known = np.nan_to_num(np.concatenate([[mass, np.linalg.norm(np.nan_to_num(moment))], inertia]))
-        first = max(DETERMINED * known[1], CENTRE_KNOWN * known[0])
-        allowed = np.repeat([DETERMINED * known[0], first, DETERMINED * np.abs(known[2:]).max()], [1, 3, 6])
-        return np.asarray((high - low) / 2 <= np.maximum(allowed, 0))
+        # Mass and moments are at least where their intervals begin.
+        return determined(low, high, sizes_of_body(low))
 
     def in_words(self) -> list[str]:
         """The mass, the centre of mass, what is determined, and what the mass cannot tell."""

@@ -21,6 +21,9 @@ PARAMETERS = {
 """Inertial parameters of a rigid body with their units: its mass, mass times the centre of mass, and its inertia about
 the origin of its frame (not about the centre of mass), in the order of pinocchio."""
 
+NEVER_NEGATIVE = ("mass", "Ixx", "Iyy", "Izz")
+"""Which of them are at least zero in every body."""
+
 
 def rotation(angles: Numbers) -> Numbers:
     """(3, 3) matrix of URDF's roll, pitch and yaw [rad]: about the fixed x, then y, then z axis."""
@@ -74,6 +77,20 @@ def moved(parameters: Numbers, R: Numbers, p: Numbers) -> Numbers:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, p
     return from_pseudo_inertia(T @ pseudo_inertia(parameters) @ T.T)
+
+
+def largest(parameters: Numbers) -> Numbers:
+    """(10,) the largest size that each parameter can have in a body of this mass and these moments of inertia (10,).
+
+    A first moment is at most the root of mass times moment of inertia about either other axis, and a product of inertia
+    at most half of the moment about the third: `(m c_x)^2 <= m * sum of x^2`, and `2 |x y| <= x^2 + y^2`. Mass and
+    moments are their own size. Parameters that are not known (NaN) bound nothing.
+    """
+    mass, xx, yy, zz = np.maximum(np.nan_to_num(parameters[[0, 4, 6, 9]]), 0.0)
+    known = np.where(np.isfinite(parameters[[4, 6, 9]]), [xx, yy, zz], np.inf)
+    least = np.minimum(known[[1, 0, 0]], known[[2, 2, 1]])
+    first = np.sqrt(mass * np.where(np.isfinite(least), least, 0.0))
+    return np.array([mass, *first, xx, zz / 2, yy, yy / 2, xx / 2, zz])
 
 
 def _six(inertia: Numbers) -> Numbers:

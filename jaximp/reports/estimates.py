@@ -329,7 +329,9 @@ def _table_of_sums(parameters: dict[str, Any]) -> Table:
     ]
     remark = (
         "A link's mass, first moments (mc) and inertia move the torque together with those of links further out: each "
-        "row is the sum that the motion shows. The URDF knows no friction and no rotors."
+        "row is the sum that the motion shows. The URDF knows no friction and no rotors. A parameter is not determined "
+        "where half of its interval is more than a quarter of its size: of itself, or of what first moments and "
+        "products of inertia can be in links of the URDF's mass and moments of inertia."
     )
     return Table(columns, rows, [k for k, row in enumerate(rows) if row[-1]], remark)
 

@@ -6,11 +6,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 from factories.chains import RATE, TWO_JOINTS, chain_in, motion, recording, truth_of, urdf_in
 from factories.robots import joint, link
+from jaximp.consistency import consistent_ranges
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.filter_settings import FilterSettings
 from jaximp.identification.identify import estimate
@@ -65,6 +67,23 @@ def test_errors_know_what_rows_have_in_common() -> None:
     of_slow, fewer = covariance_of(W, slow, valid)
     assert np.sqrt(of_slow[0, 0]) > 2 * textbook[0]
     assert fewer < dof
+
+
+def test_determined_means_the_same_for_an_estimate_and_for_the_robots_within_its_errors(
+    chain: Chain, runs: list[Estimates]
+) -> None:
+    """A first moment near zero whose interval is narrow is determined, though its relative error is large."""
+    alone = [name for name in chain.names if chain.sums[name] == name]
+    stderr, theta = np.array(runs[0].stderr), np.array(runs[0].value)
+    for name, value, error in (("link2.mc_x", 0.001, 0.006), ("link2.mc_z", 0.1, 0.05)):
+        k = chain.names.index(name)
+        theta[:, k], stderr[:, k] = value, error
+    found = replace(runs[0], fit=eqx.tree_at(lambda fit: (fit.theta, fit.stderr), runs[0].fit, (theta, stderr)))
+    ranges = consistent_ranges(chain, theta[0], np.diag(stderr[0] ** 2), alone)
+    loose = {name for name, known in zip(alone, ranges.determined, strict=True) if not known}
+    assert set(found.undetermined()) & set(alone) == loose
+    assert "link2.mc_z" in loose
+    assert "link2.mc_x" not in loose
 
 
 def test_joints_count_by_their_noise(chain: Chain, runs: list[Estimates]) -> None:
