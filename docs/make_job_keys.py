@@ -208,7 +208,8 @@ def recording() -> Iterator[str]:
     yield "### [recording], [robot_recording] and [robot_recording_after]\n"
     yield (
         "Where the measurements are: `file`, a path that begins at the job's folder, and the columns. "
-        "`[robot_recording]` has the same keys, and is the recording of the robot alone, without a human or a load. "
+        "`[robot_recording]` has the same keys, and is the recording of the robot alone, without a human or a load; "
+        "its columns are those of `[recording]` unless it names both position and torque. "
         "`[robot_recording_after]` has them too, and is a second one, made after the recording with the human: it "
         "tells how far the robot changed. "
         "Of `[recording]` alone, `file` may be a list of files with the same columns (and `rows` a list of pairs), or "

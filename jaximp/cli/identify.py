@@ -40,21 +40,21 @@ def identify_into(job: Job, folder: Path) -> None:
         _identify_trials_into(job, folder)
         return
     from jaximp.identification.identify import at_other_lengths, in_windows, longest_of
-    from jaximp.jobs.run import prepare, weigh
+    from jaximp.jobs.run import load_pair, prepare, weigh
 
     # Figures take long to import: that is done while the other core compiles.
     Thread(target=import_module, args=("jaximp.reports.estimates",)).start()
     with bar_of("identifying") as progress:
-        recording, alone = job.load(), job.load_robot_alone()
+        recording, alone, held_out, pair = job.load(), job.load_robot_alone(), job.load_held_out(), load_pair(job)
         progress(0.1)
-        prepared = prepare(job, recording, alone, job.load_held_out())
+        prepared = prepare(job, recording, alone, held_out)
         progress(0.3)
         estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), longest_of(prepared))
         others = at_other_lengths(prepared, alone, progress=lambda share: progress(0.6 + 0.2 * share))
         from jaximp.reports.estimates import write_results
 
         lengths = [] if longest_of(prepared) is None else sorted([estimates[0], *others], key=lambda e: e.window)
-        found = weigh(job)
+        found = weigh(job, pair)
         progress(0.9)
         write_results(folder, estimates, lengths, job, prepared.recording, found)
         progress(1.0)

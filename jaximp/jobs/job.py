@@ -151,7 +151,8 @@ class WindowJob:
     """A recording that the estimates must predict without having seen it: a table as `[recording]`, whose columns are
     those of `[recording]` where it names none; or the share of the recording at its end that is kept back."""
     robot_recording: Mapping[str, Any] | None = None
-    """The recording of the robot alone, for the four methods."""
+    """The recording of the robot alone, for the four methods, or without a load. Its columns are those of `[recording]`
+    unless it names position and torque."""
     robot_recording_after: Mapping[str, Any] | None = None
     """A second one, made after the recording with the human."""
     payload: PayloadSettings | None = None
@@ -185,31 +186,28 @@ class WindowJob:
         if isinstance(self.held_out, float):
             whole = self._joined([self.recording, *self.more_recordings]) if whole is None else whole
             return part_of(whole, 1 - self.held_out, 1.0)
-        columns = {key: value for key, value in self.recording.items() if key not in ("file", "rows", "name")}
-        return self._joined([{**columns, **self.held_out}])
+        return self._joined([self.held_out], "[held_out]")
 
-    def _joined(self, tables: list[Mapping[str, Any]]) -> Recording:
+    def _joined(self, tables: list[Mapping[str, Any]], where: str = "[recording]") -> Recording:
         """All recordings of some tables as one, in which the filters do not cross from one into the next."""
-        several = [one for table in tables for one in recordings_from_mapping(table, self.folder)]
+        several = [one for table in tables for one in recordings_from_mapping(table, self.folder, where)]
         return join_recordings(several, gap_between(design_filters(self.filter, several[0].sample_rate)))
 
     def load_robot_alone(self) -> RobotAlone:
         """The recording of the robot alone, where the job has one; both of them where it has two."""
         if self.robot_recording is None or self.payload is not None:
             return None
-        before = recording_from_mapping(self.robot_recording, self.folder)
+        before = recording_from_mapping(self.robot_recording, self.folder, "[robot_recording]")
         if self.robot_recording_after is None:
             return before
-        return before, recording_from_mapping(self.robot_recording_after, self.folder)
+        return before, recording_from_mapping(self.robot_recording_after, self.folder, "[robot_recording_after]")
 
     def load_pair(self) -> tuple[list[Recording], list[Recording]]:
         """All recordings of a robot without a load, and all with it, each by itself."""
         assert self.robot_recording is not None
-        several = [one for table in (self.recording, *self.more_recordings) for one in self._each(table)]
-        return self._each(self.robot_recording), several
-
-    def _each(self, table: Mapping[str, Any]) -> list[Recording]:
-        return list(recordings_from_mapping(table, self.folder))
+        tables = (self.recording, *self.more_recordings)
+        several = [one for table in tables for one in recordings_from_mapping(table, self.folder)]
+        return recordings_from_mapping(self.robot_recording, self.folder, "[robot_recording]"), several
 
     def load_design(self) -> FourierSeries | None:
         """The motion that was designed, where the job names one."""
@@ -346,9 +344,9 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     job = WindowJob(
         recording=several[0],
         more_recordings=tuple(several[1:]),
-        held_out=_held_out(tables.get("held_out")),
-        robot_recording=tables.get("robot_recording"),
-        robot_recording_after=tables.get("robot_recording_after"),
+        held_out=_held_out(tables.get("held_out"), several[0]),
+        robot_recording=_of_robot(tables.get("robot_recording"), several[0]),
+        robot_recording_after=_of_robot(tables.get("robot_recording_after"), several[0]),
         payload=payload_settings(tables["payload"]) if "payload" in tables else None,
         model=model,
         window=_window(tables.get("window", {}), model),
@@ -377,9 +375,24 @@ def _window(table: Any, model: ModelSettings) -> WindowSettings:
     return window
 
 
-def _held_out(value: Any) -> Mapping[str, Any] | float | None:
-    if value is None or isinstance(value, dict):
-        return value
+def _inherited(table: Mapping[str, Any], recording: Mapping[str, Any]) -> Mapping[str, Any]:
+    """With the columns of `[recording]` where a table names none, but not with a second clock."""
+    own = ["file", "rows", "name", *(("time", "sample_rate") if {"time", "sample_rate"} & table.keys() else ())]
+    return {**{key: value for key, value in recording.items() if key not in own}, **table}
+
+
+def _of_robot(table: Mapping[str, Any] | None, recording: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """A table that names position and torque stands for itself: other columns, or a gear, may not be in its file."""
+    if table is None or table.keys() >= {"position", "torque"}:
+        return table
+    return _inherited(table, recording)
+
+
+def _held_out(value: Any, recording: Mapping[str, Any]) -> Mapping[str, Any] | float | None:
+    if value is None:
+        return None
+    if isinstance(value, dict):
+        return _inherited(value, recording)
     share = checked(value, float, "held_out")
     if not 0 < share < 1:
         raise ValueError(f"held_out is {share:g}: it is the share of the recording that is kept back, such as 0.2")

@@ -6,6 +6,8 @@ from jaximp.identification.check import Finding, Proposal, check_recording
 from jaximp.identification.drive_gains import DriveGains
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.identify import estimate
+from jaximp.identification.payload import required_chain
+from jaximp.identification.pipeline import Pipeline
 from jaximp.identification.prepared import Prepared
 from jaximp.identification.prepared import prepare as prepare_recording
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
@@ -40,15 +42,32 @@ def identify_recording(
     return estimate(job.pipeline_for(recording), recording, alone, progress, held_out)
 
 
-def weigh(job: WindowJob) -> Weighed | DriveGains | None:
-    """What a job with `[payload]` asks for: the load, or by a known load the gains of the drives.
+def load_pair(job: WindowJob) -> tuple[list[Recording], list[Recording]] | None:
+    """The recordings that `weigh` needs, without and with a load, where a job has a `[payload]`.
 
-    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    **Raises:** `ValueError` as `weigh` for what is wrong before anything is computed.
     """
     if job.payload is None:
         return None
     alone, loaded = job.load_pair()
-    return job.payload.found(job.pipeline(loaded[0].joints, loaded[0].sample_rate), alone, loaded)
+    required_chain(_pipeline_of(job, loaded))
+    return alone, loaded
+
+
+def weigh(job: WindowJob, pair: tuple[list[Recording], list[Recording]] | None = None) -> Weighed | DriveGains | None:
+    """What a job with `[payload]` asks for: the load, or by a known load the gains of the drives; from a pair of
+    recordings that was read already, or from the job's.
+
+    **Raises:** `ValueError` with one line that names the cause and the remedy.
+    """
+    pair = load_pair(job) if pair is None else pair
+    if job.payload is None or pair is None:
+        return None
+    return job.payload.found(_pipeline_of(job, pair[1]), *pair)
+
+
+def _pipeline_of(job: WindowJob, loaded: list[Recording]) -> Pipeline:
+    return job.pipeline(loaded[0].joints, loaded[0].sample_rate)
 
 
 def prepare(

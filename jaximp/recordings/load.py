@@ -83,33 +83,36 @@ def load_recording(
         return assemble(take_clock(signals, sample_rate), signals, joints, path.stem if name is None else name)
 
 
-def recording_from_mapping(table: Mapping[str, Any], folder: str | os.PathLike[str]) -> Recording:
+def recording_from_mapping(
+    table: Mapping[str, Any], folder: str | os.PathLike[str], where: str = "[recording]"
+) -> Recording:
     """The recording that a job file's `[recording]` table describes.
 
-    **Arguments:** `table` the keywords of `load_recording`, and `file`; `folder` where a relative `file` starts.
+    **Arguments:** `table` the keywords of `load_recording`, and `file`; `folder` where a relative `file` starts; what
+    errors call the table (`where`).
 
     **Raises:** `ValueError` for an unknown or missing key, and as `load_recording`.
     """
-    (recording,) = recordings_from_mapping(table, folder, several=False)
+    (recording,) = recordings_from_mapping(table, folder, where, several=False)
     return recording
 
 
 def recordings_from_mapping(
-    table: Mapping[str, Any], folder: str | os.PathLike[str], several: bool = True
+    table: Mapping[str, Any], folder: str | os.PathLike[str], where: str = "[recording]", several: bool = True
 ) -> list[Recording]:
     """As `recording_from_mapping`, of a table whose `file` may be a list: their columns are the same, and `rows` may
     list a pair for each."""
-    check_mapping(table, "[recording]", "file")
+    check_mapping(table, where, "file")
     if "file" not in table:
-        raise RecordingError("[recording]: 'file' is missing; add it")
+        raise RecordingError(f"{where}: 'file' is missing; add it")
     files = table["file"] if isinstance(table["file"], list) and several else [table["file"]]
     if not files or not all(isinstance(file, str) for file in files):
-        raise RecordingError(f"[recording]: 'file' must be a path in quotes, not {table['file']!r}")
+        raise RecordingError(f"{where}: 'file' must be a path in quotes, not {table['file']!r}")
     rows = table.get("rows")
     if not (isinstance(rows, list) and rows and isinstance(rows[0], list)):
         rows = [rows] * len(files)
     if len(rows) != len(files):
-        raise RecordingError(f"[recording]: rows lists {len(rows)} pairs for {len(files)} files: give one, or one each")
+        raise RecordingError(f"{where}: rows lists {len(rows)} pairs for {len(files)} files: give one, or one each")
     mapping = {key: table[key] for key in table if key not in ("file", "rows")}
     return [load_recording(Path(folder) / file, **mapping, rows=pair) for file, pair in zip(files, rows, strict=True)]
 

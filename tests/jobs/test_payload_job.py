@@ -12,11 +12,14 @@ import pytest
 from command_line import jaximp
 from factories.chains import chain_in, with_load
 from jaximp.batch.plan import of_recordings
+from jaximp.cli.identify import identify_into
 from jaximp.identification import DriveGains
 from jaximp.jobs import WindowJob, parse_job
+from jaximp.jobs import run as jaximp_run
 from jaximp.jobs.payload import Weighed
 from jaximp.jobs.run import weigh
 from jaximp.models.spatial import about, pseudo_inertia
+from jaximp.recordings.load import recording_from_mapping
 from jaximp.reports.pages import Alert, Listing, Page, Table, write_page
 from jaximp.reports.payload import load_pictures, load_sections, write_load
 
@@ -138,6 +141,49 @@ def test_a_job_finds_gains_by_a_known_load(folder: Path, tmp_path: Path) -> None
     (table,) = (part for part in section.parts if isinstance(part, Table))
     assert [row[1] for row in table.rows] == [f"{gain:.4g}" for gain in found.theta]
     assert any(isinstance(part, Listing) and part.text == "\n".join(content["words"][-2:]) for part in section.parts)
+
+
+@pytest.mark.parametrize("table", ["robot_recording", "held_out"])
+def test_columns_are_those_of_the_recording_where_a_table_names_none(table: str, folder: Path) -> None:
+    text = JOB.replace(f'[robot_recording]\nfile = "without.csv"\n{COLUMNS}', f'[{table}]\nfile = "without.csv"\n')
+    job = parse_job(text + ("[payload]\n" if table == "robot_recording" else ""), folder)
+    assert isinstance(job, WindowJob)
+    if table == "held_out":
+        own = job.load_held_out()
+        assert own is not None
+    else:
+        ((own,), _) = job.load_pair()
+    known = recording_from_mapping({**job.recording, "file": "without.csv"}, folder)
+    np.testing.assert_array_equal(own.torque, known.torque)
+    text = text.replace(f"[{table}]\n", f"[{table}]\nsample_rate = 100\n")
+    other = parse_job(text + ("[payload]\n" if table == "robot_recording" else ""), folder)
+    assert isinstance(other, WindowJob)
+    assert "time" not in getattr(other, table)
+
+
+def test_a_table_with_columns_of_its_own_takes_none_of_the_recording(folder: Path) -> None:
+    text = JOB.replace("[robot_recording]", "reference = [2, 3]\n[robot_recording]")
+    job = parse_job(text + "[payload]\n", folder)
+    assert isinstance(job, WindowJob)
+    assert "reference" not in (job.robot_recording or {})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"without.csv"', '"no.csv"', "no.csv: there is no such file"),
+        ('file = "without.csv"', "", r"\[robot_recording\]: 'file' is missing"),
+        ('file = "without.csv"', 'file = "without.csv"\nvelocty = 4', r"\[robot_recording\]: unknown key 'velocty'"),
+        ("[model.robot]", '[model.robot]\ntip = "base"', "which link bears the load"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_computed(
+    old: str, new: str, message: str, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(jaximp_run, "prepare", lambda *args: pytest.fail("it was prepared"))
+    job = parse_job(JOB.replace(old, new) + "[payload]\n", folder)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        identify_into(job, tmp_path)
 
 
 def test_a_job_without_a_payload_weighs_nothing(folder: Path) -> None:
