@@ -21,7 +21,7 @@ from jaximp.models.base import combine
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import FAMILYWISE
 from jaximp.trust.verdicts import NO_DATA, WEAK
-from jaximp.trust.window_rules import POSITIVE_INERTIA
+from jaximp.trust.window_rules import POSITIVE_INERTIA, is_chain
 from jaximp.types import Progress, Recording, RobotAlone
 
 GOOD, LOOK, BAD = "ok", "look", "bad"
@@ -33,6 +33,8 @@ WIDEST = 2 * np.pi
 """No human joint turns further than this [rad]."""
 MOST_GLITCHES = 1e-3
 """A share of the samples beyond which the recorder should be looked at."""
+MOST_NAMED = 5
+"""Parameters that are named."""
 LONGEST_WINDOW = 5.0
 """In which the noise is looked for before a window is chosen [s]."""
 
@@ -56,7 +58,8 @@ class Proposal:
     decimation_cutoff: float
     """[Hz]"""
     window: float | None
-    """[s]; None where no length that was tried excites the model."""
+    """[s]; None where no length that was tried excites the model, and for a robot from its URDF, whose window is the
+    whole recording."""
     why: str
 
 
@@ -88,14 +91,15 @@ def check_recording(
             f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
         )
     )
+    why = "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that"
+    if is_chain(pipeline.model.roles):  # such a robot is identified from the whole recording
+        progress(0.3)
+        return [*findings, _whole(pipeline, recording)], Proposal(position_cutoff, decimation_cutoff, None, why)
     findings += [_delay(pipeline, recording), *_robot(pipeline, recording, alone)]
     progress(0.3)
     window, of_windows = _window(pipeline, recording, alone, progress)
-    why = (
-        "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that; "
-        "the window that predicts the next one best: a longer one is more precise, a shorter one follows changes sooner"
-    )
-    return [*findings, *of_windows], Proposal(position_cutoff, decimation_cutoff, window, why)
+    why += "; the window that predicts the next one best: a longer one is more precise, a shorter one follows changes"
+    return [*findings, *of_windows], Proposal(position_cutoff, decimation_cutoff, window, f"{why} sooner")
 
 
 def coherent_bandwidth(recording: Recording) -> float:
@@ -232,13 +236,33 @@ def _robot(pipeline: Pipeline, recording: Recording, alone: RobotAlone) -> list[
     return []
 
 
+def _whole(pipeline: Pipeline, recording: Recording) -> Finding:
+    """Which parameters of a robot from its URDF the recording determines, as one window."""
+    duration = len(recording) / recording.sample_rate
+    try:
+        found = estimate(pipeline.with_window(duration, duration), recording)[0]
+    except ValueError as error:
+        return Finding("excitation", BAD, f"the robot cannot be identified: {error}")
+    names, residuals = found.names, found.residuals
+    if found.verdicts.verdict[0] == NO_DATA or not np.isfinite(found.value).all():
+        return Finding("excitation", BAD, f"nothing is determined: {found.verdicts.reason[0]}")
+    loose = found.undetermined()
+    left = "" if residuals is None else f", and leaves {residuals.total:.2%} of the torque unexplained"
+    text = f"the recording determines {len(names) - len(loose)} of {len(names)} parameters{left}"
+    if not loose:
+        return Finding("excitation", GOOD, text)
+    worst = sorted(loose, key=lambda name: -loose[name])
+    more = f" and {len(worst) - MOST_NAMED} more" if len(worst) > MOST_NAMED else ""
+    return Finding("excitation", LOOK, f"{text}; not determined: {', '.join(worst[:MOST_NAMED])}{more}")
+
+
 def _window(
     pipeline: Pipeline, recording: Recording, alone: RobotAlone, progress: Progress
 ) -> tuple[float | None, list[Finding]]:
     """Of a few lengths in which nine windows of ten are excited, the one that predicts the next window best."""
     duration = len(recording) / recording.sample_rate
     tried = [length for length in (0.5, 1.0, 2.0, 5.0, 10.0) if length <= duration / 3]
-    seen, good, signs = [], {}, []
+    seen, good, signs = [], {}, list[bool]()
     for count, length in enumerate(tried):
         estimates = _trial(pipeline, recording, alone, length)
         progress(0.3 + 0.7 * (count + 1) / len(tried))
@@ -247,13 +271,14 @@ def _window(
         verdict = estimates.verdicts.verdict
         with_data = verdict != NO_DATA
         share = float((verdict[with_data] != WEAK).mean()) if with_data.any() else 0.0
-        signs.append(estimates.verdicts.rule[with_data] == POSITIVE_INERTIA)
+        signs += (estimates.verdicts.rule[with_data] == POSITIVE_INERTIA).tolist()
         seen.append(f"{length:g} s {share:.0%}")
-        if share >= 0.9:
-            good[length] = float(np.nanmean(estimates.held_out_vaf[with_data]))
+        predicted = estimates.held_out_vaf[with_data & np.isfinite(estimates.held_out_vaf)]
+        if share >= 0.9 and len(predicted):
+            good[length] = float(np.mean(predicted))
     return max(good, key=lambda length: good[length], default=None), [
         _excitation(seen, good),
-        *([_sign()] if signs and np.mean(np.concatenate(signs)) > 0.5 else []),
+        *([_sign()] if signs and np.mean(signs) > 0.5 else []),
     ]
 
 
@@ -268,7 +293,7 @@ def _trial(pipeline: Pipeline, recording: Recording, alone: RobotAlone, length: 
 
 def _excitation(seen: list[str], good: dict[float, float]) -> Finding:
     if good:
-        held_out = ", ".join(f"{length:g} s {vaf:.0%}" for length, vaf in good.items())
+        held_out = ", ".join(f"{length:g} s {f'{vaf:.0%}' if vaf > 0 else 'none'}" for length, vaf in good.items())
         return Finding("excitation", GOOD, f"variance explained in the next, unseen window: {held_out}")
     text = "windows that are excited: " + (", ".join(seen) if seen else "none could be tried")
     return Finding("excitation", BAD, f"{text}: the motion does not excite this model, or the model is too large")

@@ -290,7 +290,7 @@ class _OfModel:
         reflex, of which nothing is said one by one."""
         apart, bands = _apart(place), None
         theta, stderr = (np.asarray(x) for x in (solved.fit.theta, solved.fit.stderr))
-        size = sizes(np.abs(np.nanmedian(theta, axis=0)), model.roles) if misfits else np.zeros(0)
+        size = sizes(np.abs(_middle(theta)), model.roles) if misfits else np.zeros(0)
         if solved.beside is not None and misfits:
             both = np.asarray(solved.beside.theta)[::apart], theta[::apart]
             bands = compare_bands(*(both[::-1] if ordinary else both))
@@ -314,7 +314,7 @@ class _OfModel:
         if drive is None or not (drive.failed or drive.off is not None):
             return self
         theta, stderr = (np.asarray(x)[:: _apart(place)] for x in (fit.theta, fit.stderr))
-        found = drive.off_by(names, np.abs(np.nanmedian(theta, axis=0)), _error_of_mean(stderr))
+        found = drive.off_by(names, np.abs(_middle(theta)), _error_of_mean(stderr))
         lacking = {name: f"{MOVED}: {text}" for name, text in found.items()}
         said = [text for name, text in found.items() if name in judged]
         why = drive.failed or (f"{MOVED}: {', '.join(said)}" if said else "")
@@ -364,7 +364,7 @@ def _drive_note(prepared: Prepared, misfits: tuple[Misfit, ...], theta: Numbers)
             return _assumed(prepared, misfits)
         if own not in significant(misfits):
             return f"the motion is taken as imposed, which its {drive.source} does not contradict (model.drive)"
-        names, found = prepared.model.names, np.nanmedian(theta, axis=0) + own.move
+        names, found = prepared.model.names, _middle(theta) + own.move
         values = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, found, strict=True))
         return f"the motion is taken as imposed; instrumental variables by the {drive.source} find {values}"
     if pipeline.drive == FREELY and not has_instruments(pipeline):
@@ -387,6 +387,12 @@ def _assumed(prepared: Prepared, misfits: tuple[Misfit, ...]) -> str:
                 "the joint's own torque moves it (model.drive = 'free'), or is in the position"
             )
     return "the motion is taken as imposed; if the joint's own torque moves it too, say model.drive = 'free'"
+
+
+def _middle(theta: Numbers) -> Numbers:
+    """(p,) median of each parameter over the windows (M, p) that determine it; NaN where none does."""
+    known = [column[np.isfinite(column)] for column in theta.T]
+    return np.array([np.median(column) if len(column) else np.nan for column in known])
 
 
 def _error_of_mean(stderr: Numbers) -> Numbers:

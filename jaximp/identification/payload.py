@@ -296,7 +296,8 @@ def _aligned(alone: Recording, loaded: Recording) -> tuple[Recording, Recording,
     def distance(shift: int) -> float:
         n = min(len(alone) - max(shift, 0), len(loaded) + min(shift, 0))
         apart = alone.position[max(shift, 0) :][:n:every] - loaded.position[max(-shift, 0) :][:n:every]
-        return float(np.nanmean(apart**2))
+        known = apart[np.isfinite(apart)]
+        return float(np.mean(known**2)) if len(known) else np.inf
 
     every = max(1, min(len(alone), len(loaded)) // COMPARED)
     reach = min(round(FARTHEST * alone.sample_rate), min(len(alone), len(loaded)) // 2)

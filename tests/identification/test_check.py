@@ -1,15 +1,22 @@
 """The look at the data before a run."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from factories.chains import RATE, chain_in, recording
 from factories.joints import JOB, TIME, joint
-from jaximp.identification.check import BAD, LOOK, coherent_bandwidth
+from jaximp.identification import check as check_module
+from jaximp.identification.check import BAD, LOOK, check_recording, coherent_bandwidth
+from jaximp.identification.pipeline import Pipeline
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import check, identify_recording
 from jaximp.recordings.load import recording_from_arrays
+from jaximp.trust.verdicts import NO_DATA, TRUSTED
 
 
 @pytest.mark.slow
@@ -79,3 +86,43 @@ def test_what_is_wrong_is_seen() -> None:
     assert found["position: saturation"].verdict == "ok"
     assert "step 0.01" in found["position: noise"].text
     assert f"the position jumps ({TIME[lost - 1]:.6g} s)" in found["gaps"].text
+
+
+def test_a_robot_is_looked_at_as_one_window(tmp_path: Path) -> None:
+    """As it is identified: no window is proposed, and nothing is predicted from windows that are too short."""
+    chain = chain_in(tmp_path, offset=True)
+    findings, proposal = check_recording(Pipeline(RATE, chain), recording(chain, 0))
+    assert proposal.window is None
+    assert "window" not in proposal.why
+    found = {finding.topic: finding for finding in findings}
+    assert "delay" not in found
+    text = found["excitation"].text
+    assert re.match(rf"the recording determines \d+ of {len(chain.names)} parameters, and leaves ", text)
+    assert ("not determined: " in text) == (found["excitation"].verdict == LOOK)
+
+
+def test_a_recording_without_data_is_said_to_have_none_without_a_warning(tmp_path: Path) -> None:
+    """No window counts: there is nothing to take a mean of, and no library complains."""
+    robot = recording(chain_in(tmp_path), 0)
+    gaps = replace(robot, valid=np.arange(len(robot)) % 200 < 30)
+    limit = np.arange(len(robot)) % 100 < 5
+    cut_off = replace(robot, clipped=limit, valid=~limit)
+    for own in (gaps, cut_off):
+        found = {one.topic: one for one in check_recording(Pipeline(RATE, chain_in(tmp_path)), own)[0]}
+        assert found["excitation"].verdict == BAD
+        assert "nan" not in found["excitation"].text
+
+
+@pytest.mark.parametrize("verdict", [NO_DATA, TRUSTED])
+def test_windows_without_data_are_said_to_have_none_without_a_warning(
+    verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor do windows that predict no other, as where a single one counts."""
+    of_one = SimpleNamespace(verdict=np.array([verdict]), rule=np.array([""]))
+    tried = SimpleNamespace(verdicts=of_one, held_out_vaf=np.array([np.nan]))
+    monkeypatch.setattr(check_module, "_trial", lambda *args: tried)
+    findings, proposal = check(parse_job(JOB), joint())
+    found = {one.topic: one for one in findings}
+    assert proposal.window is None
+    assert found["excitation"].verdict == BAD
+    assert "nan" not in found["excitation"].text
