@@ -11,12 +11,13 @@ import numpy as np
 
 from jaximp import plots
 from jaximp.identification.drive_gains import DriveGains
-from jaximp.identification.payload import CENTRE_KNOWN, DETERMINED, Payload
+from jaximp.identification.payload import Payload
 from jaximp.identification.quantities import Quantities
 from jaximp.jobs.payload import Weighed
 from jaximp.models.spatial import PARAMETERS
 from jaximp.plots.wording import number, pretty_unit
 from jaximp.reports.pages import Alert, Column, Figure, Listing, Part, Prose, Section, Table, capitalised, digits
+from jaximp.trust.determined import determined, sizes_of_body
 from jaximp.types import Numbers
 
 FIGURE, TITLE = "load_by_method", "Load by method"
@@ -79,17 +80,20 @@ def _rows(load: Payload) -> list[_Row]:
     """Mass, centre of mass, and inertia about it."""
     mass = Quantities(load.names[:1], load.units[:1], load.theta[:1], load.covariance[:1, :1], load.dof[:1])
     centre, inertia = load.centre, load.inertia_about_centre
-    largest = np.nan_to_num(inertia.theta[[0, 2, 5]]).max()
-    far = max(DETERMINED * float(np.linalg.norm(np.nan_to_num(centre.theta))), CENTRE_KNOWN)
+    low = load.interval()[0]
+    first = sizes_of_body(low)[1:4] / load.theta[0] if load.theta[0] > 0 else np.zeros(3)
+    six = sizes_of_body(np.concatenate([low[:4], inertia.interval()[0]]))[4:]
     several = (
-        (mass, ["mass"], "kg", 1.0, DETERMINED * load.theta[0]),
-        (centre, [f"centre of mass, {axis}" for axis in "xyz"], "mm", 1e3, far),
-        (inertia, [f"{name} about the centre" for name in INERTIA], "kg m²", 1.0, DETERMINED * largest),
+        (mass, ["mass"], "kg", 1.0, np.zeros(1)),
+        (centre, [f"centre of mass, {axis}" for axis in "xyz"], "mm", 1e3, first),
+        (inertia, [f"{name} about the centre" for name in INERTIA], "kg m²", 1.0, six),
     )
     return [
-        _Row(name, unit, factor * value, factor * half, bool(half <= allowed))
-        for found, names, unit, factor, allowed in several
-        for name, value, half in zip(names, found.theta, _halves(found), strict=True)
+        _Row(name, unit, factor * value, factor * half, bool(known))
+        for found, names, unit, factor, size in several
+        for name, value, half, known in zip(
+            names, found.theta, _halves(found), determined(*found.interval(), size), strict=True
+        )
     ]
 
 
@@ -115,8 +119,9 @@ def _table(found: Weighed) -> Table:
         rows.append([*cells, *(f"{digits(other[k].value)} {_reach(other[k].half)}".strip() for other in others)])
     remark = (
         f"In the frame of {found.loads[0].frame}; the inertia in axes parallel to those of that frame. Determined is "
-        "what has an interval of at most a quarter of the mass, of the distance of its centre (or 1 cm), and of the "
-        "largest moment of inertia, to either side. Nothing is known of the centre where the mass may be zero."
+        "what has an interval of at most a quarter of its size to either side: of itself, or of what a coordinate of "
+        "the centre or a product of inertia can be in a body of this mass and these moments of inertia. Nothing is "
+        "known of the centre where the mass may be zero."
     )
     void = [k for k, row in enumerate(first) if not row.determined]
     return Table(heads, rows, void, remark)
