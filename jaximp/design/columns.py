@@ -83,7 +83,7 @@ class Load(Model):
 
     def __init__(self, robot: Chain):
         if robot.tip is None or robot.tree.tip_body < 0:
-            raise ValueError(f"{robot.robot} has no moving tip that bears a load: pass tip= with one of its links")
+            raise ValueError(f"{robot.robot} has no moving tip that bears a load: set tip to one of its links")
         self.robot, self.n_joints, self.label, self.in_link = robot, robot.n_joints, "load", robot.load_in_link
         self.names, self.units = tuple(f"load.{name}" for name in PARAMETERS), tuple(PARAMETERS.values())
         self.columns = tuple(f"{name} at {robot.tip} of {robot.robot}" for name in PARAMETERS)

@@ -386,7 +386,14 @@ def _assumed(prepared: Prepared, misfits: tuple[Misfit, ...]) -> str:
                 "the motion is taken as imposed, but what is left of the torque belongs with later motion: noise of "
                 "the joint's own torque moves it (model.drive = 'free'), or is in the position"
             )
+    if not _has_human(prepared.model):  # a robot is moved by its own torque, and everybody knows
+        return ""
     return "the motion is taken as imposed; if the joint's own torque moves it too, say model.drive = 'free'"
+
+
+def _has_human(model: Model) -> bool:
+    """Whether something has a stiffness, as a human has, by itself or at the end of a robot."""
+    return any(role.kind == "stiffness" for role in model.roles)
 
 
 def _middle(theta: Numbers) -> Numbers:
@@ -452,7 +459,8 @@ def _threshold(prepared: Prepared, place: Placement, method: int | None) -> tupl
             "human alone does not fit their condition number and is not applied"
         )
     if isinstance(prepared.reference, str):
-        return None, prepared.reference
+        unasked = prepared.pipeline.reference is None and prepared.recording.reference is None
+        return None, "" if unasked and not _has_human(prepared.model) else prepared.reference
     q, dq, ddq = (x[:, 0] if prepared.recording.n_joints == 1 else x for x in prepared.reference)
     rate = prepared.recording.sample_rate
     W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))

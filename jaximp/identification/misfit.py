@@ -43,6 +43,8 @@ USUAL = (0.05, 0.95)
 HIDES = {"lag": "stiffness"}
 """Whatever yields in series with a joint makes its stiffness smaller, by as much as no column shows."""
 
+MOST_NAMED = 5
+"""Parameters that a note names."""
 FAINT = 0.01
 """Where another weight of the frequencies alone moves a parameter by such a share, what is hidden may move it by
 `SHARE`: stiffness that relaxes mostly below the motion's frequencies does."""
@@ -398,11 +400,21 @@ def in_words(misfits: Sequence[Misfit], off: Mapping[str, float]) -> str:
     if not off:
         return ""
     best = _suspected(misfits)[0]
-    changes = [f"{name} would change by {_by(best, share)}" for name, share in off.items() if np.isfinite(share)]
+    known = {name: share for name, share in off.items() if np.isfinite(share)}
+    changes = largest_of(known, lambda name, share: f"{name} would change by {_by(best, share)}")
     open_ones = [name for name, share in off.items() if not np.isfinite(share)]
+    if len(open_ones) > MOST_NAMED:
+        open_ones[MOST_NAMED:] = [f"{len(open_ones) - MOST_NAMED} more"]
     changes += [f"how far {listed(open_ones)} would change cannot be told"] if open_ones else []
     more = "" if explains(best) else "; it lacks more than that"
     return f"the model lacks {culprits(misfits)}: {', '.join(changes)}{more}"
+
+
+def largest_of(shares: Mapping[str, float], said: Callable[[str, float], str]) -> list[str]:
+    """What is said of the parameters with the largest shares, in the order given, and how many more there are."""
+    chosen = sorted(shares, key=lambda name: -abs(shares[name]))[:MOST_NAMED]
+    words = [said(name, share) for name, share in shares.items() if name in chosen]
+    return [*words, f"and {len(shares) - MOST_NAMED} more"] if len(shares) > MOST_NAMED else words
 
 
 def _by(misfit: Misfit, share: float) -> str:
@@ -465,10 +477,12 @@ def open_moves(
     for one in _suspected(misfits):
         moves = np.maximum(moves, np.where(np.abs(one.move) > ERRORS * one.stderr, np.abs(one.move), 0))
     moves = np.where([name in off for name in names], 0, moves)
-    shares = [f"{name} by {x / s:.1%}" for name, x, s in zip(names, moves, size, strict=True) if x > 0 and s > 0]
-    if not shares:
+    shares = {name: x / s for name, x, s in zip(names, moves, size, strict=True) if x > 0 and s > 0}
+    noticeable = {name: share for name, share in shares.items() if share >= FAINT}
+    if not noticeable:
         return moves, ""
-    return moves, f"standard errors have grown by what the model may lack, which would move {', '.join(shares)}"
+    shown = ", ".join(largest_of(noticeable, lambda name, share: f"{name} by {share:.1%}"))
+    return moves, f"standard errors have grown by what the model may lack, which would move {shown}"
 
 
 def unnoticed(
@@ -488,7 +502,8 @@ def unnoticed(
     size = np.array([np.inf if name in spared or not s > 0 else s for name, s in zip(names, size, strict=True)])
     shares = ERRORS * np.array([one.stderr for one in misfits]) / size
     worst = misfits[int(np.argmax(shares.max(axis=1)))]
-    blinded = [f"{name} by {part:.0%}" for name, part in zip(names, shares.max(axis=0), strict=True) if part > SHARE]
+    most = {name: float(part) for name, part in zip(names, shares.max(axis=0), strict=True) if part > SHARE}
+    blinded = largest_of(most, lambda name, part: f"{name} by {part:.0%}")
     said = [_unnoticed_delay(misfits, size, kinds)]
     said += [f"{what(worst.group)}, say, could move {', '.join(blinded)} unnoticed"] if blinded else []
     return f"this motion cannot show everything: {'; '.join(filter(None, said))}" if any(said) else ""

@@ -196,7 +196,7 @@ def required_chain(pipeline: Pipeline) -> Chain:
 def require_end(chain: Chain) -> None:
     """**Raises:** `ValueError` for a chain of which no end that moves is known."""
     if chain.tip is None or chain.tree.tip_body < 0:
-        raise ValueError(f"{chain.robot}: which link bears the load? Pass tip= with a link that moves")
+        raise ValueError(f"{chain.robot}: which link bears the load? Set tip to a link that moves")
 
 
 def listed_recordings(several: Several) -> list[Recording]:

@@ -370,7 +370,7 @@ class Chain(Model):
 
     def _require_tip(self) -> None:
         if self.tip is None:
-            raise ValueError(f"{self.robot} branches, and no tip was named: pass tip= with one of its links")
+            raise ValueError(f"{self.robot} branches, and no tip was named: set tip to one of its links")
 
     def _groups(self) -> list[tuple[str, str, str]]:
         """Name, unit and column of the parameters that every joint has one of."""
@@ -550,7 +550,7 @@ def _tree(robot: Urdf, found: Bodies, tip: str | None, joints: Numbers, zeros: N
         if leader not in leading:
             raise ValueError(
                 f"{robot.source}: joint '{body.joint.name}' follows '{leader}', which does not move here: "
-                f"lock it with locked={{'{body.joint.name}': 0}}"
+                "name it in locked"
             )
         k = leading.index(leader)
         coordinates.append(multiplier * joints[k])

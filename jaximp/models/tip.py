@@ -70,7 +70,7 @@ class TipImpedance(Model):
         force: bool = True,
     ):
         if chain.tip is None:
-            raise ValueError(f"{chain.robot} has no tip: pass tip= with one of its links when it is read")
+            raise ValueError(f"{chain.robot} has no tip: set tip to one of its links when it is read")
         labels, vectors = _directions(directions)
         k, self.labels = len(labels), tuple(labels)
         self.tree, self.directions, self._digest = chain.tree, vectors, f"{chain.robot} {chain.digest}"

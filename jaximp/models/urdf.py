@@ -188,7 +188,7 @@ def moving_bodies(
         if joint.kind in ("floating", "planar"):
             raise ValueError(
                 f"{urdf.source}: joint '{joint.name}' is {joint.kind}: only joints of one degree of freedom are known; "
-                f"lock it with locked={{'{joint.name}': 0}}, or start above it with base='{joint.child}'"
+                f"name it in locked, or start above it with the base '{joint.child}'"
             )
         limits = _checked_limits(urdf.source, joint, strict)
         at[joint.child] = Frame(len(bodies), np.eye(3), np.zeros(3), joint.parent)
@@ -432,8 +432,8 @@ def _checked_limits(source: str, joint: Joint, strict: bool) -> Limits:
             limits = replace(limits, **{what: np.inf})
     if zero and strict:
         raise ValueError(
-            f"{source}: joint '{joint.name}' {zero}; correct the limit, lock the joint, or pass strict=False, which "
-            "takes it for no limit"
+            f"{source}: joint '{joint.name}' {zero}; correct the limit, lock the joint, or set strict to false, "
+            "which takes it for no limit"
         )
     return limits
 
@@ -447,5 +447,5 @@ def _check_bodies(urdf: Urdf, bodies: list[Body], base: str, strict: bool) -> No
         if strict and all(urdf.links[link] is None for link in body.links):
             raise ValueError(
                 f"{urdf.source}: link '{body.links[0]}', which joint '{body.joint.name}' moves, has no <inertial>: add "
-                "one, or pass strict=False, which takes it for massless"
+                "one, or set strict to false, which takes it for massless"
             )

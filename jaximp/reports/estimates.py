@@ -65,6 +65,8 @@ DERIVATIVES = {
 }
 LACKING = "the model lacks"
 """How a doubt begins that the tests of the model raise."""
+MOST_SAID, MOST_MOVED = 5, 3
+"""Sentences of what the model lacks, and parameters in each row of the table of a robot's tests."""
 REMEDIES = {
     TRUSTED: "",
     WEAK: "Excite the joint more, with larger and faster motion of several frequencies, or lengthen window.length.",
@@ -437,6 +439,23 @@ def _tests(content: dict[str, Any]) -> list[Section]:
     """What the model was asked for, and what it would change."""
     if not content["tests"]:
         return []
+    of_sums = any("stands_for" in value for value in content["parameters"].values())
+    columns, rows = _moves_most(content) if of_sums else _moves(content)
+    lacking = list(content["lacking"].values())
+    more = [f"and {len(lacking) - MOST_SAID} more parameters"] if len(lacking) > MOST_SAID else []
+    said = "; ".join([*lacking[:MOST_SAID], *more])
+    said = said or "Nothing that moves a parameter beyond error and 5 % was found."
+    told = (
+        "Each row adds columns to the model, over all windows at once, in rows whose noise is white. p is the "
+        "probability that so much would be found where nothing is missing; of all rows together 1 % is allowed."
+    )
+    if of_sums:
+        told += " Evidence compares suspects: the largest explains most. Moves count in intervals of the parameters."
+    return [Section("Tests of the model", [Prose(said), Table(columns, rows, remark=told)])]
+
+
+def _moves(content: dict[str, Any]) -> tuple[list[Column], list[list[str]]]:
+    """By how much what may be missing would move each parameter."""
     weights = [name for reflex in content["reflex"].values() for name in reflex["weights"]["names"]]
     names = [name for name in content["tests"][0]["move"] if name not in weights]
     columns = [Column("Is this missing?", "text"), Column("p"), *(Column(f"moves {words(name)} by") for name in names)]
@@ -444,12 +463,20 @@ def _tests(content: dict[str, Any]) -> list[Section]:
     for one in content["tests"]:
         moves = [f"{number(one['move'][name], 2)} ± {number(one['move_stderr'][name], 1)}" for name in names]
         rows.append([what(one["group"]), number(one["p"], 2), *moves])
-    said = "; ".join(content["lacking"].values()) or "Nothing that moves a parameter beyond error and 5 % was found."
-    told = (
-        "Each row adds columns to the model, over all windows at once, in rows whose noise is white. p is the "
-        "probability that so much would be found where nothing is missing; of all rows together 1 % is allowed."
-    )
-    return [Section("Tests of the model", [Prose(said), Table(columns, rows, remark=told)])]
+    return columns, rows
+
+
+def _moves_most(content: dict[str, Any]) -> tuple[list[Column], list[list[str]]]:
+    """The same for a robot of many parameters: the three that would move farthest, counted in their intervals."""
+    halves = {name: value["half_width_95"] for name, value in content["parameters"].items()}
+    columns = [Column("Is this missing?", "text"), Column("p"), Column("Evidence"), Column("Moves most", "text")]
+    rows = []
+    for one in content["tests"]:
+        share = {name: abs(move) / halves[name] for name, move in one["move"].items() if halves.get(name)}
+        most = sorted(share, key=lambda name: -share[name])[:MOST_MOVED]
+        moves = [f"{name} by {number(one['move'][name], 2)} ± {number(one['move_stderr'][name], 1)}" for name in most]
+        rows.append([what(one["group"]), number(one["p"], 2), number(one["evidence"], 2), ", ".join(moves)])
+    return columns, rows
 
 
 def frequencies_in_words(found: ByFrequency) -> str:
@@ -569,6 +596,7 @@ def _result(estimates: Estimates) -> dict[str, Any]:
                 "group": one.group,
                 "p": one.p,
                 "chi_squared": one.statistic,
+                "evidence": one.evidence,
                 "move": dict(zip(estimates.names, map(float, one.move), strict=False)),
                 "move_stderr": dict(zip(estimates.names, map(float, one.stderr), strict=False)),
             }

@@ -246,6 +246,24 @@ def test_what_may_be_missing_widens_the_errors_of_what_stays_trusted() -> None:
     assert open_moves([found("reflex", [0.01, 0, 0], [0.02, 0.01, 0.01])], *NAMED)[1] == ""
 
 
+def test_notes_name_the_five_largest_moves_of_many_and_none_that_nobody_notices() -> None:
+    names, size = [f"link{k}" for k in range(9)], np.ones(9)
+    move = [0.02, 0.0001, 0.04, 0.03, 0.011, 0.012, 0.045, 0.002, 0.013]
+    late = found("delay", move, [1e-5] * 9)
+    moves, note = open_moves([late], names, size)
+    np.testing.assert_array_equal(moves, move)
+    assert note.endswith("move link0 by 2.0%, link2 by 4.0%, link3 by 3.0%, link6 by 4.5%, link8 by 1.3%, and 2 more")
+    assert open_moves([found("delay", [0.001] * 9, [1e-5] * 9)], names, size)[1] == ""
+    hidden = found("lag", [0.0] * 9, [0.05 + 0.01 * k for k in range(9)])
+    assert unnoticed([hidden], names, size).endswith(
+        "could move link4 by 18%, link5 by 20%, link6 by 22%, link7 by 24%, link8 by 26%, and 4 more unnoticed"
+    )
+    off = {f"{name}{k}": 0.1 for k, name in enumerate(names)} | {f"open{k}": np.nan for k in range(7)}
+    words = in_words([found("lag", [0.1], [0.01])], off)
+    assert words.count("would change by") == 5
+    assert ", and 4 more, how far open0, open1, open2, open3, open4 and 2 more would change cannot be told" in words
+
+
 def test_a_small_delay_leaves_intervals_that_hold_the_truth(ankles: ModuleType) -> None:
     """It makes the inertia 4 to 5 % small, beyond the errors of generalised least squares."""
     pipeline, joint = ankles.pipeline(RATE), ankles.WRONG["torque 1 ms late"]

@@ -47,6 +47,10 @@ def test_a_recording_is_one_window_by_default(runs: list[Estimates]) -> None:
     assert runs[0].end[0] - runs[0].start[0] > 19.5
 
 
+def test_a_robot_is_told_nothing_of_human_joints(runs: list[Estimates]) -> None:
+    assert not [note for note in runs[0].notes if "eq. 16" in note or "imposed" in note]
+
+
 def test_the_truth_is_found_and_the_intervals_hold_it(chain: Chain, runs: list[Estimates]) -> None:
     truth = truth_of(chain)
     apart = np.array([(one.value[0] - truth) / one.stderr[0] for one in runs])

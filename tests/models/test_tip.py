@@ -117,5 +117,5 @@ def test_a_robot_needs_a_tip() -> None:
     from factories.robots import TREE
 
     tree = Chain(parse_urdf(TREE))
-    with pytest.raises(ValueError, match="has no tip: pass tip="):
+    with pytest.raises(ValueError, match="has no tip: set tip"):
         TipImpedance(tree)

@@ -65,7 +65,10 @@ MALFORMED = {
         robot(link("hub"), link("rim"), joint("a", "hub", "rim"), joint("b", "rim", "hub")),
         "the joints a and b form a loop",
     ),
-    "floating": (TWO.replace('"elbow" type="revolute"', '"elbow" type="floating"'), "lock it with locked="),
+    "floating": (
+        TWO.replace('"elbow" type="revolute"', '"elbow" type="floating"'),
+        "name it in locked, or start above it with the base",
+    ),
     "following nobody": (
         TWO.replace("</joint></robot>", "<mimic/></joint></robot>").replace(
             "</joint><link", '<mimic joint="wrist"/></joint><link'
@@ -151,6 +154,14 @@ def test_a_deep_tree_is_no_recursion() -> None:
     assert body.links == ("l899",)
 
 
+def test_what_strict_refuses_is_said_for_job_files_as_for_python() -> None:
+    massless = TWO.replace(TWO[TWO.index("<inertial>") : TWO.rindex("</inertial>") + 11], "")
+    still = TWO.replace('lower="-2" upper="2.5"', 'lower="0" upper="0"')
+    for text in (massless, still):
+        with pytest.raises(ValueError, match="or set strict to false, which takes"):
+            Chain(parse_urdf(text))
+
+
 def test_less_strict_takes_zeros_for_unknown() -> None:
     text = TWO.replace('velocity="3"', 'velocity="0"').replace('lower="-2" upper="2.5"', 'lower="0" upper="0"')
     massless = text.replace(link("upper", 2.0, "0.17 0.02 0"), '<link name="upper"/>')
@@ -168,7 +179,7 @@ def test_limits_and_names_are_those_of_the_file() -> None:
     np.testing.assert_array_equal(chain.limits.lower, [-2, -2, -np.inf, -2])
     np.testing.assert_array_equal(chain.limits.velocity, 3)
     assert chain.tip is None
-    with pytest.raises(ValueError, match="tree branches, and no tip was named: pass tip="):
+    with pytest.raises(ValueError, match="tree branches, and no tip was named: set tip"):
         chain.jacobian(np.zeros(4))
 
 

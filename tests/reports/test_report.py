@@ -229,3 +229,22 @@ def test_a_parameter_that_is_not_determined_is_said_in_the_table(
     answer = page[page.index("<table") : page.index("</table>")]
     rows = {name: answer[answer.index(name) :].split("</tr>")[0] for name in ("inertia", "damping", "stiffness")}
     assert ["not determined" in row for row in rows.values()] == [True, False, False]
+
+
+def test_the_tests_of_a_robot_name_what_would_move_most() -> None:
+    """Thirty-eight columns are no table."""
+    names = [f"link{k}.mass" for k in range(9)]
+    known = {"half_width_95": 0.1, "stands_for": "itself"}
+    move = {name: (-1) ** k * 0.01 * k for k, name in enumerate(names)} | {"link4.mass": -0.5}
+    one = {"group": "delay", "p": 0.001, "evidence": 12.3, "move": move, "move_stderr": dict.fromkeys(names, 0.004)}
+    content = {
+        "tests": [one], "parameters": dict.fromkeys(names, known), "reflex": {},
+        "lacking": {name: f"{name} is off" for name in names},
+    }  # fmt: skip
+    (section,) = report._tests(content)
+    said, table = section.parts
+    assert [column.head for column in table.columns] == ["Is this missing?", "p", "Evidence", "Moves most"]
+    (row,) = table.rows
+    assert row[2] == "12"
+    assert [part.split(" by ")[0] for part in row[3].split(", ")] == ["link4.mass", "link8.mass", "link7.mass"]
+    assert said.text.endswith("link4.mass is off; and 4 more parameters")
