@@ -115,6 +115,8 @@ class Design:
             lines.append(
                 "a larger motion would keep the limits: the condition number does not ask for size, stderr does"
             )
+        moved = self.moved or self.model
+        lines += moved.notes if isinstance(moved, Chain) else ()
         return lines + ([] if self.clearance is None else list(self.clearance.notes))
 
     def limits_reached(self) -> str:

@@ -38,6 +38,7 @@ from jaximp.identification.suspects import DRIVE
 from jaximp.least_squares.sliding import score
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
+from jaximp.models.chain import Chain
 from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
 from jaximp.trust import plausibility
@@ -111,6 +112,7 @@ def judge(
         _literal_note(pipeline),
         why_not,
         _likeness(measured, limits),
+        *(model.notes if isinstance(model, Chain) else ()),
         *of_model.notes,
         _delay(prepared, rows, misfits),
         *notes,

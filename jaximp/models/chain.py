@@ -22,7 +22,7 @@ from jaximp.models.joint import parameter_units
 from jaximp.models.rigid_body import KinematicTree
 from jaximp.models.spatial import PARAMETERS, moved
 from jaximp.models.urdf import Bodies, Frame, Joint, Urdf, following, moving_bodies, read_urdf, require_known
-from jaximp.types import AnyArray, Numbers
+from jaximp.types import AnyArray, Numbers, listed
 
 GRAVITY = (0.0, 0.0, -9.81)
 ROWS, FEWEST_MOTIONS = 1200, 40
@@ -108,6 +108,8 @@ class Chain(Model):
     """`revolute` or `prismatic`."""
     link_names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """The URDF's links of each body."""
+    notes: tuple[str, ...] = eqx.field(static=True)
+    """What is strange about the URDF's own values."""
     tip: str | None = eqx.field(static=True)
     stribeck_unknown: bool = eqx.field(static=True)
     """Whether `stribeck` is but a beginning, and is to be found."""
@@ -148,6 +150,7 @@ class Chain(Model):
         self.joint_kinds = tuple("prismatic" if joint.kind == "prismatic" else "revolute" for joint in leaders)
         self.n_joints, self.robot, self.label = len(names), robot.robot, "robot"
         self.link_names = tuple(body.links for body in found.bodies)
+        self.notes = _strange(robot, [link for links in self.link_names for link in links])
         self._limits = tuple(tuple(getattr(joint.limits, key) for joint in leaders) for key in JointLimits._fields)
         self._leaders = tuple(k for k, body in enumerate(found.bodies) if body.joint.mimic is None)
         self._frames = tuple(
@@ -410,6 +413,16 @@ class Chain(Model):
             W = W / np.maximum(np.linalg.norm(W, axis=(0, 2)), np.finfo(float).tiny)[:, None]
             rows.append(W.reshape(len(W), -1).T)
         return find_base(rows[0], names, [*bodies, *range(len(bodies), len(names))], rows[1])
+
+
+def _strange(robot: Urdf, links: Sequence[str]) -> tuple[str, ...]:
+    """That links have an inertia without a mass, which no body has."""
+    own = {link: robot.links[link] for link in links}
+    found = [link for link, x in own.items() if x is not None and x[0] == 0 and x[4:].any()]
+    if not found:
+        return ()
+    have = "has" if len(found) == 1 else "have"
+    return (f"by {robot.source} {listed(found)} {have} an inertia but no mass, as no body has: correct the file",)
 
 
 def _lanes(chain: Chain, q: Array, dq: Array, ddq: Array) -> Array:

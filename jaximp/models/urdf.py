@@ -216,9 +216,17 @@ def root_of(text: str, source: str) -> ET.Element:
         raise ValueError(f"{source} is not XML: {error}; give the path of a URDF file") from None
     if root.tag != "robot":
         raise ValueError(f"{source} is no URDF: it begins with <{root.tag}>, and a URDF with <robot>; convert it")
-    if any("xacro}" in element.tag for element in root if isinstance(element.tag, str)):
+    for element in [one for one in root if _defines(one)]:
+        root.remove(element)
+    if any("xacro}" in element.tag for element in root.iter() if isinstance(element.tag, str)):
         raise ValueError(f"{source} is a xacro file: run `xacro {source} > robot.urdf`, and give robot.urdf")
     return root
+
+
+def _defines(element: ET.Element) -> bool:
+    """Whether it is a definition of xacro, which some tools leave behind: nothing comes of it by itself."""
+    _, inside, name = str(element.tag).rpartition("xacro}")
+    return bool(inside) and name in ("property", "macro", "arg")
 
 
 class _Reader:
@@ -246,6 +254,10 @@ class _Reader:
         name = element.get("name")
         if not name:
             raise self.error(f"a <{element.tag}> has no name: give it one")
+        if "${" in name or "$(" in name:
+            raise self.error(
+                f"a <{element.tag}> is called '{name}': that is xacro; run `xacro {self.source} > robot.urdf`"
+            )
         return name
 
     def numbers(self, element: ET.Element | None, key: str, default: str | None, count: int, where: str) -> Numbers:

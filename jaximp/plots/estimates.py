@@ -22,6 +22,7 @@ from jaximp.plots.style import (
     BLUE,
     HATCH,
     LINES,
+    MEASURED,
     ORANGE,
     PALE,
     STYLE,
@@ -130,7 +131,8 @@ def torque(estimates: Estimates, model: str = "model, fitted") -> Figure:
         panels[0, 0].set_title("whole recording, smallest to largest", loc="left")
         panels[0, 1].set_title(f"{EXCERPT:g} s of it", loc="left")
     for panel in panels[-1]:
-        panel.set_xlabel("time (s)")
+        # A clock that began long before says so.
+        panel.set_xlabel("time (s)" if time[0] <= time[-1] - time[0] else "time by the recording's clock (s)")
         panel.margins(x=0)
     figure.align_ylabels(panels[:, 0])
     _legend(figure, panels[0, -1], [])
@@ -380,7 +382,8 @@ def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, pa
     time, measured = estimates.time[part], estimates.torque[part, joint]
     seen, unseen = estimates.reconstructed[part, joint], estimates.predicted[part, joint]
     far = beyond(torque_limits(estimates.torque[:, joint]))
-    draw_line(upper, time, measured, color=BLACK, linewidth=1.5, label="measured")
+    # Wide and pale, so that it shows on both sides of a model that hardly differs.
+    draw_line(upper, time, measured, color=MEASURED, linewidth=3.5, label="measured")
     draw_line(upper, time, np.clip(seen, *far), color=BLUE, linewidth=1, label=model)
     draw_line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
     if np.isfinite(unseen).any():

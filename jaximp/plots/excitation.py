@@ -32,9 +32,8 @@ def design(found: Design) -> Figure:
             draw_line(axis, motion["time"], x, color=color, linestyle=style, label=f"joint {j + 1}")
         limit = getattr(found.limits, name)
         ends = limit if name == "position" else (-np.asarray(limit), np.asarray(limit))
-        for value in np.unique([np.ravel(end) for end in np.broadcast_arrays(*ends)]):
-            if np.isfinite(value):
-                axis.axhline(value, color=BLACK, linestyle=":", linewidth=0.8)
+        for end in np.broadcast_arrays(*ends):
+            _limits(axis, np.broadcast_to(np.ravel(end), n))
         axis.set(ylabel=f"{name}\n({UNITS[name]})", xlim=(0, found.period))
         axis.tick_params(labelbottom=axis is axes[-1])
     title = fill(f"One period; dotted: limits. Reached: {found.limits_reached()}", TITLE)
@@ -45,6 +44,14 @@ def design(found: Design) -> Figure:
     _harmonics(spectrum, series)
     _sliding_condition(condition, found)
     return figure
+
+
+def _limits(axis: Axes, ends: np.ndarray) -> None:
+    """Dotted; each joint's in its own color where they differ."""
+    alike = (ends == ends[0]).all()
+    for j, value in enumerate(ends[:1] if alike else ends):
+        if np.isfinite(value):
+            axis.axhline(value, color=BLACK if alike else _line(j)[0], linestyle=":", linewidth=0.8 if alike else 1.1)
 
 
 def _line(j: int) -> tuple[str, Any]:

@@ -28,6 +28,8 @@ POINTS = 4000
 # Okabe and Ito: told apart by every kind of colour vision, and by lightness in print.
 BLACK, BLUE, VERMILLION, GREEN, ORANGE = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00"
 PALE, HATCH = "0.55", "0.75"
+MEASURED = "0.68"
+"""A wide line under that of a model."""
 LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (ORANGE, ":"), (BLACK, (0, (5, 1, 1, 1, 1, 1))))
 STYLE: Any = {
     "figure.constrained_layout.use": True,

@@ -154,6 +154,32 @@ def test_a_deep_tree_is_no_recursion() -> None:
     assert body.links == ("l899",)
 
 
+@pytest.mark.parametrize(
+    "left",
+    [
+        '<xacro:property name="M_PI" value="3.14159"/>',
+        '<xacro:arg name="prefix" default=""/>',
+        '<xacro:macro name="arm" params="prefix"><link name="${prefix}arm"/><xacro:arm2/></xacro:macro>',
+    ],
+)
+def test_definitions_that_xacro_left_behind_do_not_matter(left: str) -> None:
+    head = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" '
+    text = TWO.replace("<robot ", head).replace("</robot>", f"{left}</robot>")
+    np.testing.assert_array_equal(Chain(parse_urdf(text)).links, Chain(parse_urdf(TWO)).links)
+    for open_yet in ('<xacro:arm prefix="a"/>', "<xacro:if value='1'/>", '<xacro:include filename="x"/>'):
+        with pytest.raises(ValueError, match="is a xacro file: run"):
+            parse_urdf(text.replace("</robot>", f"{open_yet}</robot>"))
+    with pytest.raises(ValueError, match="is called .*that is xacro"):
+        parse_urdf(text.replace("</robot>", '<link name="${prefix}arm"/></robot>'))
+
+
+def test_an_inertia_without_a_mass_is_noted() -> None:
+    assert Chain(parse_urdf(TWO)).notes == ()
+    text = TWO.replace('<mass value="2.0"/>', '<mass value="0"/>')
+    (note,) = Chain(parse_urdf(text, "robot.urdf")).notes
+    assert note == "by robot.urdf upper has an inertia but no mass, as no body has: correct the file"
+
+
 def test_what_strict_refuses_is_said_for_job_files_as_for_python() -> None:
     massless = TWO.replace(TWO[TWO.index("<inertial>") : TWO.rindex("</inertial>") + 11], "")
     still = TWO.replace('lower="-2" upper="2.5"', 'lower="0" upper="0"')

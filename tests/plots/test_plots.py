@@ -17,7 +17,8 @@ from factories.estimates import identified, repeat, without_trust
 from jaximp import plots
 from jaximp.identification.estimates import Estimates
 from jaximp.models import SIX_JOINT_ARM, ArmGeometry, Chain, EndpointImpedance, endpoint_impedance
-from jaximp.plots.style import POINTS, draw_line
+from jaximp.plots import excitation
+from jaximp.plots.style import BLACK, POINTS, draw_line
 from jaximp.trust.verdicts import TRUSTED
 
 
@@ -166,3 +167,27 @@ def test_a_robot_is_drawn_where_its_joints_are() -> None:
         expected = arm.forward_kinematics(np.zeros(6) if q is None else np.atleast_2d(q)[0])[1]
         np.testing.assert_allclose(np.ravel(tip.get_data()), np.asarray(expected)[[0, 2]], atol=1e-12)
     assert "path of the tip" in words_on(figure)
+
+
+def test_what_was_measured_shows_under_a_model_that_hardly_differs(estimates: Estimates) -> None:
+    upper = plots.torque(estimates).axes[1]
+    lines = {str(line.get_label()): line for line in upper.get_lines()}
+    model = lines["model, fitted"]
+    assert lines["measured"].get_linewidth() > 3 * model.get_linewidth()
+    assert lines["measured"].get_color() != model.get_color()
+
+
+def test_a_clock_that_began_long_before_is_said_to_be_the_recordings(estimates: Estimates) -> None:
+    late = replace(estimates, time=estimates.time + 1723.0)
+    assert "time by the recording's clock (s)" in words_on(plots.torque(late))
+    assert "recording's clock" not in words_on(plots.torque(estimates))
+
+
+def test_limits_of_joints_that_differ_have_the_colors_of_their_joints() -> None:
+    axis = Figure().subplots()
+    excitation._limits(axis, np.array([1.0, 2.0, np.inf, 2.5]))
+    joints = [excitation._line(j)[0] for j in (0, 1, 3)]
+    assert [line.get_color() for line in axis.get_lines()] == joints
+    alike = Figure().subplots()
+    excitation._limits(alike, np.array([1.0, 1.0]))
+    assert [line.get_color() for line in alike.get_lines()] == [BLACK]
