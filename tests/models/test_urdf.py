@@ -169,7 +169,7 @@ def test_definitions_that_xacro_left_behind_do_not_matter(left: str) -> None:
     for open_yet in ('<xacro:arm prefix="a"/>', "<xacro:if value='1'/>", '<xacro:include filename="x"/>'):
         with pytest.raises(ValueError, match="is a xacro file: run"):
             parse_urdf(text.replace("</robot>", f"{open_yet}</robot>"))
-    with pytest.raises(ValueError, match="is called .*that is xacro"):
+    with pytest.raises(ValueError, match=r"is called .*that is xacro"):
         parse_urdf(text.replace("</robot>", '<link name="${prefix}arm"/></robot>'))
 
 
