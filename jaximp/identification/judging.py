@@ -43,6 +43,7 @@ from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
 from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
+from jaximp.trust.determined import sizes_of_chain
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
 from jaximp.trust.window_rules import (
@@ -305,7 +306,10 @@ class _OfModel:
         lacking |= {name: in_words(misfits, {name: share}) for name, share in off.items()}
         why = "; ".join(filter(None, [why, *others]))
         moves, grown = open_moves(*tests, known) if misfits else (np.zeros(len(model.names)), "")
-        notes = (harmless(*tests, known), grown, unnoticed(*tests, spared=weights))
+        # Shares of a robot's first moments and products of inertia near zero would mean nothing.
+        whole = np.maximum(size, sizes_of_chain(model)) if misfits and isinstance(model, Chain) else size
+        unseen = unnoticed(misfits, model.names, whole, tests[-1], spared=weights)
+        notes = (harmless(*tests, known), grown, unseen)
         return cls(why, remedy, lacking, bands, moves, notes)
 
     def with_drive(
