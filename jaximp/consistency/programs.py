@@ -16,9 +16,9 @@ from jaxtyping import Num
 
 from jaximp.consistency.cone import BASIS, Posed, pose
 from jaximp.models.chain import Chain
+from jaximp.models.determined import determined, sizes_of_chain
 from jaximp.models.spatial import NEVER_NEGATIVE
 from jaximp.results import Column, Result
-from jaximp.trust.determined import determined, sizes_of_chain
 from jaximp.types import AnyArray, Numbers, Progress, nearest
 
 MARGIN = 1e-4
@@ -76,7 +76,7 @@ class Ranges:
     """(k,) largest values; inf where there is none."""
     determined: AnyArray
     """(k,) whether the data determine the parameter: half of the interval is at most a quarter of its middle, or for
-    first moments and products of inertia of what they can be by the URDF (`trust.determined`)."""
+    first moments and products of inertia of what they can be by the URDF (`models.determined`)."""
     level: float
     distance: float
     """Of the nearest robot from the estimate, in standard errors."""

@@ -16,10 +16,10 @@ from jaximp.identification.residuals import Residuals
 from jaximp.least_squares.window import SlidingFit, WindowFit, confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.chain import Chain
+from jaximp.models.determined import DETERMINED, openness, sizes_of_chain
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.models.tip import TipImpedance
 from jaximp.results import Column, Result
-from jaximp.trust.determined import DETERMINED, openness, sizes_of_chain
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit
@@ -282,7 +282,7 @@ class Estimates(Result):
     def undetermined(self) -> dict[str, float]:
         """Parameters that the data do not determine, and how far from it they are.
 
-        Of a robot from its URDF those by `trust.determined`, with half of their interval (the median over all windows)
+        Of a robot from its URDF those by `models.determined`, with half of their interval (the median over all windows)
         as a share of their size. Of other models those whose standard error in one window is, in the median over those
         that can be trusted in it, a larger share of their size in all windows than `limits.max_relative_stderr`; and
         that share. The rules of a window are milder: they compare with what would explain the whole torque by itself.

@@ -39,11 +39,11 @@ from jaximp.least_squares.sliding import score
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
 from jaximp.models.chain import Chain
+from jaximp.models.determined import sizes_of_chain
 from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
 from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
-from jaximp.trust.determined import sizes_of_chain
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
 from jaximp.trust.window_rules import (

@@ -26,10 +26,10 @@ from jaximp.identification.quantities import Quantities, freedom
 from jaximp.identification.rows import Rows, measure, regress
 from jaximp.identification.separation import OTHER_MOTION
 from jaximp.models.chain import Chain
+from jaximp.models.determined import determined, sizes_of_body
 from jaximp.models.spatial import PARAMETERS
 from jaximp.recordings.join import part_of
 from jaximp.results import Parameter
-from jaximp.trust.determined import determined, sizes_of_body
 from jaximp.types import AnyArray, Numbers, Recording, listed
 
 LOAD_METHODS = {
@@ -85,7 +85,7 @@ class Payload(Quantities):
     @property
     def determined(self) -> NDArray[np.bool_]:
         """(10,) which parameters the recordings determine: half of the interval is at most a quarter of the parameter,
-        or for first moments and products of inertia of what they can be (`trust.determined`)."""
+        or for first moments and products of inertia of what they can be (`models.determined`)."""
         low, high = self.interval()
         # Mass and moments are at least where their intervals begin.
         return determined(low, high, sizes_of_body(low))

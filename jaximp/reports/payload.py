@@ -14,10 +14,10 @@ from jaximp.identification.drive_gains import DriveGains
 from jaximp.identification.payload import Payload
 from jaximp.identification.quantities import Quantities
 from jaximp.jobs.payload import Weighed
+from jaximp.models.determined import determined, sizes_of_body
 from jaximp.models.spatial import PARAMETERS
 from jaximp.plots.wording import number, pretty_unit
 from jaximp.reports.pages import Alert, Column, Figure, Listing, Part, Prose, Section, Table, capitalised, digits
-from jaximp.trust.determined import determined, sizes_of_body
 from jaximp.types import Numbers
 
 FIGURE, TITLE = "load_by_method", "Load by method"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from factories.real_robots import PLANAR
+from jaximp.models.determined import determined, openness, sizes_of_body, sizes_of_chain
 from jaximp.models.spatial import PARAMETERS, about, from_pseudo_inertia, largest
-from jaximp.trust.determined import determined, openness, sizes_of_body, sizes_of_chain
 
 NAMES = list(PARAMETERS)
 
