@@ -13,6 +13,7 @@ from . import recordings as recordings
 from . import reports as reports
 from . import signals as signals
 from . import simulation as simulation
+from . import tracking as tracking
 from . import trust as trust
 from .design.excitation import Design as Design
 from .design.excitation import design_excitation as design_excitation
@@ -42,6 +43,7 @@ from .posterior.inference import compare_models as compare_models
 from .recordings.load import load_recording as load_recording
 from .recordings.load import recording_from_arrays as recording_from_arrays
 from .recordings.save import save_recording as save_recording
+from .tracking.paths import track as track
 from .trust.limits import TrustLimits as TrustLimits
 from .types import Recording as Recording
 

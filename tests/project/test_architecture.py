@@ -17,9 +17,9 @@ PACKAGE = ROOT / "jaximp"
 TESTS = ROOT / "tests"
 
 PACKAGES = (
-    "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "consistency",
-    "trust", "identification", "perturbation", "posterior", "design", "simulation", "jobs", "plots", "reports",
-    "batch", "papers", "cli",
+    "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "tracking",
+    "consistency", "trust", "identification", "perturbation", "posterior", "design", "simulation", "jobs", "plots",
+    "reports", "batch", "papers", "cli",
 )  # fmt: skip
 """From the ground up: a package imports from those before it, and from itself."""
 

@@ -30,7 +30,7 @@ def test_the_top_level_is_small() -> None:
         "adaptive_least_squares", "compare_models", "confidence_interval", "design_excitation", "fit_stiffness",
         "identify", "identify_impedance", "identify_recording", "identify_trials", "infer", "load_posterior",
         "load_recording", "parse_job", "read_job", "recording_from_arrays", "recursive_least_squares",
-        "sample_posterior", "save_posterior", "save_recording", "sliding_least_squares", "sliding_pieces",
+        "sample_posterior", "save_posterior", "save_recording", "sliding_least_squares", "sliding_pieces", "track",
     }  # fmt: skip
 
 

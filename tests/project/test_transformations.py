@@ -18,7 +18,7 @@ import pytest
 
 import jaximp
 from factories import robots
-from jaximp import models, signals
+from jaximp import models, signals, tracking
 from jaximp.design import objectives
 from jaximp.least_squares import chunks, sliding
 from jaximp.models import arm as planar
@@ -133,6 +133,12 @@ CASES = [
         "W",
         still=nonzero,
         note="the lengths of the windows are those that were found",
+    ),
+    Case(
+        "tracking.smoothed_path",
+        lambda x: tracking.smoothed_path(x, Y, grid=4, drift=np.array([0.1, 0.0]), noise=0.1),
+        W,
+        "W",
     ),
     Case("recursive_least_squares", lambda x: jaximp.recursive_least_squares(x, Y, 0.9), W, "W", still=nonzero),
     Case("signals.filter_zero_phase", lambda x: signals.filter_zero_phase(LOW_PASS, x), W, "the signal"),

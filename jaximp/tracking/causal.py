@@ -1,0 +1,94 @@
+"""What is known of the parameters up to each instant, where they may jump at any time.
+
+A bank of Kalman filters stands side by side: one has seen no jump of late, others that one parameter jumped at such a
+point. From time to time the most probable of them splits, and those that explain least make room. After a jump the
+filter that knows of it needs a few rows to prevail, however slowly the parameters drift otherwise.
+
+**Source:** Gaussian sums: Alspach and Sorenson 1972; splitting and pruning: Bar-Shalom, Li and Kirubarajan, Estimation
+with applications to tracking and navigation, 2001, chapter 11.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaximp.tracking.state_space import (
+    Motion,
+    covariance_of,
+    log_volume,
+    moments,
+    moved,
+    start,
+    widened,
+    with_rows,
+)
+
+BANK = 32
+"""Filters of each model."""
+
+
+class _Bank(NamedTuple):
+    known: Float[Array, "d e H L"]
+    evidence: Float[Array, "H L"]
+    """Of each filter, but for what it knows at present."""
+    log_weight: Float[Array, "H L"]
+
+
+def filtered(
+    rows: Float[Array, "G r f"], motion: Motion, scale: Array, log_jump: Array, moving: Array, every: int
+) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
+    """Mean and covariance at each point.
+
+    **Arguments:** `motion` of L models, whose jumps are left out of account; `scale` (L,) square of the noise's;
+    `log_jump` logarithm of the probability that a parameter jumps within `every` points, which lie between two splits,
+    and `moving` (p,) which may: without any a single filter runs for each model."""
+    points, p = len(rows), rows.shape[-1] - 1
+    bank = BANK if len(moving) else 1
+    wide = jax.tree.map(lambda x: x[:, None], motion)
+    known = start(motion)
+    known = jnp.broadcast_to(known[:, :, None], (*known.shape[:2], bank, known.shape[2]))
+    one = jnp.where(jnp.arange(bank) == 0, 0.0, -1e6)[:, None] + jnp.zeros_like(scale)
+
+    def step(at: _Bank, now: tuple[Array, Array]) -> tuple[_Bank, tuple[Array, Array]]:
+        k, block = now
+        before, less = moved(at.known, wide, jnp.zeros_like(wide.walk))
+        at = at._replace(known=before, evidence=at.evidence + less / 2)
+        if len(moving):
+            at = jax.lax.cond(k % every == 0, lambda at: _split(at, moving, log_jump), lambda at: at, at)
+        known, left = with_rows(at.known, block)
+        evidence = at.evidence - left / (2 * scale)
+        log_weight = evidence - log_volume(known)
+        theta, root = moments(known[-p:, -p - 1 :])
+        weight = jax.nn.softmax(log_weight, axis=0)
+        return _Bank(known, evidence, log_weight), _mixed(theta, covariance_of(root) * scale, weight)
+
+    return jax.lax.scan(step, _Bank(known, one, one), (jnp.arange(points), rows))[1]
+
+
+def _mixed(
+    theta: Float[Array, "p H L"], covariance: Float[Array, "p p H L"], weight: Float[Array, "H L"]
+) -> tuple[Float[Array, "p L"], Float[Array, "p p L"]]:
+    """Mean and covariance over the filters of each model."""
+    mean = (weight * theta).sum(axis=1)
+    apart = theta - mean[:, None]
+    return mean, (weight * (covariance + apart[:, None] * apart)).sum(axis=2)
+
+
+def _split(at: _Bank, moving: Array, log_jump: Array) -> _Bank:
+    """The most probable filter, with a jump of each parameter, in the place of the least probable ones."""
+    p, best = len(moving), jnp.argmax(at.log_weight, axis=0)
+    order = jnp.argsort(at.log_weight, axis=0)
+    lanes, d = jnp.arange(len(best)), len(at.known)
+    known, evidence, log_weight = at
+    for i in range(p):
+        child, less = widened(at.known[:, :, best, lanes], d - p + i, jnp.asarray(moving[i], known.dtype))
+        place = order[i], lanes
+        gone = log_jump + jnp.where(moving[i], less / 2, -1e6)
+        known = known.at[(slice(None), slice(None), *place)].set(child)
+        evidence = evidence.at[place].set(at.evidence[best, lanes] + gone)
+        log_weight = log_weight.at[place].set(at.log_weight[best, lanes] + gone)
+    return _Bank(known, evidence, log_weight)

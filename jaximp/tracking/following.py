@@ -1,0 +1,148 @@
+"""The models of one kind: found on a coarse grid, and followed through the record on the fine one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaximp.numerics.compilation import compiled
+from jaximp.tracking.blocks import Blocks, Scales, merged
+from jaximp.tracking.causal import filtered
+from jaximp.tracking.drift import NONE, Drawn, Search, rate_of, rates, step_of
+from jaximp.tracking.state_space import (
+    Motion,
+    forward,
+    moments,
+    own_triangle,
+    smoother,
+    triangularise,
+)
+from jaximp.types import AnyArray, Numbers
+
+SEARCHED = 1500
+"""Drift sizes are found on a grid of so many points at most; the path has all of them."""
+SHOWN, CAUSAL = 16, 4
+"""How many models of each kind are followed through the record, and how many of them forward only."""
+
+
+class Moments(eqx.Module):
+    """Mean and covariance at each point."""
+
+    theta: Float[AnyArray, "G p"]
+    covariance: Float[AnyArray, "G p p"]
+
+
+class Followed(eqx.Module):
+    """The models of one kind, in scales of the record."""
+
+    path: Moments
+    filtered: Moments
+    jumped: NDArray[np.float64]
+    """(G, p)"""
+    size: NDArray[np.float64]
+    """(L, p) as `Drift.size`."""
+    innovations: AnyArray
+    """(G, r) of the most probable model."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Models of one kind, which were found on a coarse grid."""
+
+    search: Search
+    drawn: Drawn
+    every: int
+    """Points of the fine grid for one of the coarse one."""
+    unit: Numbers
+    """(p,) what a size of one (`Drift.size`) does in a step of the fine grid, in the scales of the record."""
+
+
+def find(fine: Blocks, by: Scales, sizes: Numbers, jumps: bool, apart: float, seed: int, order: int) -> Found:
+    """**Arguments:** `fine` scaled blocks; `sizes` (p,) as `Drift.size`, NaN where they are to be found; `apart` time
+    between two points [s]."""
+    every, information = -(-len(fine.rows) // SEARCHED), np.asarray(by.information)
+    coarse, unit = _merged(fine, every), apart ** (order + 0.5) / np.asarray(by.theta)
+    given, tried = rate_of(sizes * unit, information, order) * every, rates(len(coarse.rows))
+    choices = tuple(tried if np.isnan(rate) else np.array([rate]) for rate in given)
+    search = Search(coarse, information * every, order, choices, jumps)
+    return Found(search, search.drawn(seed), every, unit)
+
+
+def follow(fine: Blocks, found: Found, seed: int) -> Followed:
+    """Their paths on the fine grid."""
+    search, drawn, every = found.search, found.drawn, found.every
+    inside = np.random.default_rng(seed).integers(0, every, drawn.models.at.shape)
+    models, information = drawn.models.finer(every, inside), search.information / every
+
+    def motion(lanes: NDArray[np.int64]) -> tuple[Motion, Array]:
+        return models[lanes].motion(information, search.order), jnp.asarray(drawn.scale[lanes])
+
+    shown, moving = drawn.some(SHOWN), search.moving & search.jumping
+    best = jnp.argmax(jnp.asarray(drawn.log_weight[shown]))
+    theta, covariance, innovations = _path(fine.rows, *motion(shown), best)
+    causal = _filtered(
+        fine.rows, *motion(drawn.some(CAUSAL)), jnp.asarray(search.log_jump),
+        jnp.asarray(moving if moving.any() else moving[:0]), every=every,
+    )  # fmt: skip
+    step = step_of(models.rate[:, shown], information[:, None], search.order) * np.sqrt(drawn.scale[shown])
+    jumped = np.repeat(_jump_probability(drawn, search.points), every, axis=0)[: len(fine.rows)] / every
+    return Followed(
+        path=mixed(theta, covariance, np.full(SHOWN, 1 / SHOWN)),
+        filtered=mixed(*causal, np.full(CAUSAL, 1 / CAUSAL)),
+        jumped=jumped,
+        size=step.T / found.unit,
+        innovations=innovations,
+    )
+
+
+def mixed(theta: AnyArray, covariance: AnyArray, weight: Numbers) -> Moments:
+    """Of a mixture of L models: (G, p, L), (G, p, p, L) and (L,)."""
+    theta, covariance = np.asarray(theta), np.asarray(covariance)
+    mean = theta @ weight
+    apart = theta - mean[..., None]
+    return Moments(mean, covariance @ weight + np.einsum("gil,gjl,l->gij", apart, apart, weight))
+
+
+def _jump_probability(drawn: Drawn, points: int) -> Numbers:
+    """(G, p) probability of a jump of each parameter in front of each point."""
+    found = np.zeros((points, len(drawn.models.rate)))
+    for at, which in zip(drawn.models.at, drawn.models.which, strict=True):
+        np.add.at(found, (np.maximum(at, 0), which), np.where(at == NONE, 0, drawn.weight))
+    return np.minimum(found, 1)
+
+
+@compiled
+def _path(
+    rows: Array, motion: Motion, scale: Array, best: Array
+) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"], Float[Array, "G r"]]:
+    """What each model makes of the whole record, and the innovations of the best one."""
+    before = forward(rows, motion)[1]
+    theta, covariance = smoother(rows, motion, before)
+    innovations = _innovations(rows, jnp.moveaxis(before, 0, 2)[..., best]) / jnp.sqrt(scale[best])
+    return theta, covariance * scale, innovations
+
+
+def _innovations(rows: Float[Array, "G r f"], before: Float[Array, "d e G"]) -> Float[Array, "G r"]:
+    """What each row of a block says that was not known before, standardised by what was expected of it."""
+    theta, root = moments(own_triangle(before, rows.shape[-1] - 1))
+    block = jnp.moveaxis(rows, 0, -1)
+    regressor, r = block[:, :-1], len(block)
+    surprise = block[:, -1] - (regressor * theta).sum(axis=1)
+    spread = (regressor[:, :, None] * root).sum(axis=1)
+    # Rows of `[1 spread]` have the covariance that was expected: its triangle standardises them, one after the other.
+    whole = jnp.concatenate([jnp.eye(r)[..., None] + jnp.zeros_like(surprise), spread], axis=1)
+    upper, _ = triangularise(jnp.moveaxis(whole, 1, 0), r)
+    found: list[Array] = []
+    for i in range(r):
+        rest = surprise[i] - sum((upper[k, i] * found[k] for k in range(i)), jnp.zeros_like(surprise[i]))
+        found.append(rest / upper[i, i])
+    return jnp.stack(found, axis=1)
+
+
+_merged = compiled(merged, static_argnums=1)
+_filtered = compiled(filtered, static_argnames=("every",))

@@ -1,0 +1,267 @@
+"""Parameters of a record as a path with a band: `track`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num, Shaped
+from numpy.typing import NDArray
+
+from jaximp.least_squares.autoregression import Autoregression, whiten_rows
+from jaximp.least_squares.noise import Noise, whiten
+from jaximp.least_squares.sliding import in_samples
+from jaximp.least_squares.window import check_finite
+from jaximp.numerics.compilation import compiled, require_numbers
+from jaximp.numerics.linear_algebra import root
+from jaximp.numerics.precision import require_float64
+from jaximp.tracking.blocks import Blocks, Scales, as_blocks, compress, scaled, scales
+from jaximp.tracking.drift import NONE
+from jaximp.tracking.following import Found, Moments, find, follow, mixed
+from jaximp.tracking.results import Drift, Path, Track
+from jaximp.tracking.state_space import Motion, forward, smoother
+from jaximp.types import AnyArray, Numbers
+
+ORDERS, KINDS = (0, 1, 2), (0, 1)
+"""How often a random walk may be integrated, and the kinds of motion that are weighed against each other."""
+ROUNDS, SETTLED = 5, 1e-3
+"""How often paths are followed where drift sizes are given, until the noise is as large as it was taken to be."""
+NEGLIGIBLE = 1e-3
+"""A kind of motion that is less probable than this is not followed."""
+
+
+def track(
+    W: Num[AnyArray, "..."],
+    y: Num[AnyArray, "..."],
+    *,
+    grid: float,
+    sample_rate: float | None = None,
+    valid: Shaped[AnyArray, "..."] | None = None,
+    noise: Noise | Sequence[Autoregression] | None = None,
+    drift: Num[AnyArray, " p"] | None = None,
+    order: int | None = None,
+    jumps: bool = True,
+    names: Sequence[str] = (),
+    units: Sequence[str] = (),
+    seed: int = 0,
+) -> Track:
+    """Follow parameters that move, from all rows of a record, without a window to choose.
+
+    **Arguments:** `W` (N, p) or (N, n, p) and `y` (N,) or (N, n) [N m] rows at equal steps of time, for n outputs that
+    share the parameters (each is weighed by its own noise); `grid` how far apart the points are at which parameters may
+    move, in seconds where a `sample_rate` [Hz] is given, else in rows; `valid` False for rows that must not count.
+    `noise` is what is known of the noise: a `Noise`, or an `Autoregression` for each output; without it the rows are
+    taken as white.
+
+    Drift sizes come from the likelihood, unless `drift` (p,) gives them, as in `Drift.size`: zero for a parameter that
+    stays where it is, NaN for one to be estimated. Parameters do a random walk, or their slopes do: what the likelihood
+    makes of it, unless `order` says how often a random walk is integrated (0, 1 or 2). With `jumps=False` no parameter
+    jumps. `seed` draws the models that are averaged, and the same seed the same ones.
+
+    **Returns:** a `Track`. Its bands hold what is not known of drift sizes, of the kind of motion, and of times of
+    jumps. Where nothing moves that would tell a parameter, they are wide: before all measurements a parameter is taken
+    as zero within a hundred times the size that the record suggests.
+
+    **Raises:** ValueError for shapes that do not match, numbers that are not finite, a grid that is none, and inside
+    `jit`, `vmap` and `grad`, where `smoothed_path` serves.
+
+    **Source:** Rauch, Tung and Striebel 1965; Durbin and Koopman, Time series analysis by state space methods, 2012;
+    jumps: de Jong and Penzer 1998; see `tracking.drift` for the average over models.
+    """
+    require_numbers("track", "give drift sizes to smoothed_path", W, y, valid, drift)
+    require_float64(W, y)
+    given = _checked(W, y, valid, step := in_samples("grid", grid, sample_rate))
+    W, y, valid, every = _white(*given, noise)
+    step, p = max(1, step // every), W.shape[-1]
+    blocks = _compress(*_weighed(W, y, valid, step), step)
+    if not float(blocks.count) > p:
+        raise ValueError(f"{int(blocks.count)} rows count, for {p} parameters: give more rows")
+    rate = 1.0 if sample_rate is None else sample_rate
+    sizes = np.full(p, np.nan) if drift is None else np.asarray(drift, float)
+    if sizes.shape != (p,) or (sizes < 0).any():
+        raise ValueError(f"drift has shape {sizes.shape}: give {p} numbers from zero up, NaN for what is to be found")
+    if order not in (None, *ORDERS):
+        raise ValueError(f"order is {order}: give 0, 1 or 2, how often a random walk is integrated, or None")
+    named, kinds = _named(p, names, units), KINDS if order is None else (order,)
+    look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, seed=seed)
+    by, fine, found = _found(blocks, sizes, lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
+    time = _middles(len(blocks.rows), step, every, len(given[1])) / rate
+    return _averaged(fine, by, found, time, named, sample_rate is not None, seed)
+
+
+def smoothed_path(
+    W: Num[AnyArray, "N *n p"],
+    y: Num[AnyArray, "N *n"],
+    *,
+    grid: int,
+    drift: Num[AnyArray, " p"],
+    noise: float | Num[AnyArray, ""],
+    order: int = 0,
+    valid: Shaped[AnyArray, "N *n"] | None = None,
+) -> tuple[Path, Float[Array, ""]]:
+    """The path for known drift sizes, and the logarithm of the likelihood: `jit`, `vmap` and `grad` go through.
+
+    **Arguments:** white rows, as in `track`; `grid` in rows; `drift` (p,) standard deviation of a random step of each
+    parameter from one point of the grid to the next, or (`order` 1) of its slope per point, or (2) of the slope's;
+    `noise` standard deviation of a row [N m].
+
+    **Returns:** the path with the covariance of its errors. Before all measurements parameters are zero within a
+    hundred times of what would explain the whole torque, and slopes within what they become in the record.
+
+    **Source:** Rauch, Tung and Striebel 1965, with square roots of information (`tracking.state_space`).
+    """
+    valid = jnp.ones(jnp.shape(y), bool) if valid is None else jnp.asarray(valid, bool)
+    W, y, valid = (jnp.asarray(x)[None] for x in (W, y, valid))
+    path, log_likelihood = smoothed_paths(W, y, grid=grid, drift=drift, noise=noise, order=order, valid=valid)
+    return Path(path.theta[0], path.covariance[0]), log_likelihood[0]
+
+
+def smoothed_paths(
+    W: Num[AnyArray, "R N *n p"],
+    y: Num[AnyArray, "R N *n"],
+    *,
+    grid: int,
+    drift: Num[AnyArray, "*R p"],
+    noise: float | Num[AnyArray, "*R"],
+    order: int = 0,
+    valid: Shaped[AnyArray, "R N *n"] | None = None,
+) -> tuple[Path, Float[Array, " R"]]:
+    """`smoothed_path` of R records of one length, side by side: much faster than one after the other, or by `vmap`."""
+    counts = jnp.ones(jnp.shape(y), bool) if valid is None else jnp.asarray(valid, bool)
+    records, p = W.shape[0], W.shape[-1]
+    rows = jnp.moveaxis(jax.vmap(partial(as_blocks, grid=grid))(W, y, counts).rows, 0, -1)
+    size = root((rows**2).sum(axis=(0, 1)))
+    unit = jnp.where(size[:-1] > 0, size[-1] / jnp.where(size[:-1] > 0, size[:-1], 1), 1)
+    noise = jnp.broadcast_to(jnp.asarray(noise, float), (records,))
+    rows = rows * (jnp.concatenate([unit, jnp.ones((1, records))]) / noise)
+
+    step = jnp.broadcast_to(jnp.asarray(drift, float), (records, p)).T / unit
+    walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
+    none = jnp.full((0, records), NONE)
+    motion = Motion(walk, slope, jnp.full_like(step, len(rows)), none, none, order)
+    found, before = forward(rows, motion)
+    theta, covariance = smoother(rows, motion, before)
+    theta, covariance = jnp.moveaxis(theta * unit, -1, 0), jnp.moveaxis(covariance * unit[:, None] * unit, -1, 0)
+    log_noise = counts.reshape(records, -1).sum(axis=1) * (jnp.log(noise) + 0.5 * math.log(2 * math.pi))
+    return Path(theta, covariance), found.log_determinant - found.squares / 2 - log_noise
+
+
+def _found(
+    blocks: Blocks, sizes: Numbers, look: Callable[[Blocks, Scales], list[Found]]
+) -> tuple[Scales, Blocks, list[Found]]:
+    """Models of all kinds, in scales of the record. Sizes that are given are no multiples of the noise: where there are
+    any, this is repeated until the noise is as large as it was taken to be."""
+    by: Scales = _scales(blocks)
+    for _ in range(ROUNDS):
+        fine = _scaled(blocks, by)
+        found = look(fine, by)
+        noise = max((one.drawn for one in found), key=lambda drawn: drawn.log_evidence).noise
+        if not (sizes > 0).any() or abs(noise - 1) < SETTLED:
+            break
+        by = eqx.tree_at(lambda x: x.noise, by, by.noise * noise)
+    return by, fine, found
+
+
+def _averaged(
+    fine: Blocks, by: Scales, found: list[Found], time: Numbers, named: tuple[tuple[str, ...], ...], seconds: bool,
+    seed: int,
+) -> Track:  # fmt: skip
+    """The kinds of motion that are not out of the question, followed, and weighed by their evidence."""
+    evidence = np.array([one.drawn.log_evidence for one in found])
+    shares = np.exp(evidence - np.logaddexp.reduce(evidence))
+    kept = np.flatnonzero(shares > NEGLIGIBLE)
+    weight, unit, kinds = shares[kept] / shares[kept].sum(), np.asarray(by.theta), [found[k] for k in kept]
+    several = [follow(fine, one, seed) for one in kinds]
+    best, lanes = int(np.argmax(weight)), len(several[0].size)
+
+    def path(moments: list[Moments]) -> Path:
+        theta = np.stack([one.theta for one in moments], axis=-1)
+        known = mixed(theta, np.stack([one.covariance for one in moments], axis=-1), weight)
+        return Path(known.theta * unit, known.covariance * np.outer(unit, unit))
+
+    return Track(
+        time=time,
+        path=path([one.path for one in several]),
+        filtered=path([one.filtered for one in several]),
+        jumped=np.einsum("k,kgp->gp", weight, np.stack([one.jumped for one in several])),
+        drift=Drift(
+            np.concatenate([one.size for one in several]),
+            np.repeat([one.search.order for one in kinds], lanes),
+            np.repeat(weight / lanes, lanes),
+        ),
+        smooth=float(shares @ [one.search.order > 0 for one in found]),
+        noise=float(by.noise) * kinds[best].drawn.noise,
+        log_likelihood=float(np.logaddexp.reduce(evidence) - np.log(len(evidence))),
+        innovations=several[best].innovations,
+        names=named[0],
+        units=named[1],
+        seconds=seconds,
+    )
+
+
+def _middles(points: int, step: int, every: int, samples: int) -> Numbers:
+    """(G,) middle of the rows that belong to each point, as indices of the given ones; `every`-th of these was kept."""
+    first = np.arange(points) * step
+    last = np.minimum(first + step, -(-samples // every)) - 1
+    return every * (first + last) / 2
+
+
+_compress = compiled(compress, static_argnums=3)
+_scales, _scaled = compiled(scales), compiled(scaled)
+
+
+def _checked(W: AnyArray, y: AnyArray, valid: AnyArray | None, grid: int) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
+    """Shapes and numbers, with an axis of outputs."""
+    W, y = np.asarray(W, float), np.asarray(y, float)
+    if W.ndim not in (2, 3) or y.shape != W.shape[:-1]:
+        raise ValueError(f"W has shape {W.shape} and y {y.shape}: give (N, p) and (N,), or (N, n, p) and (N, n)")
+    counts = np.ones(y.shape, bool) if valid is None else np.asarray(valid, bool)
+    if counts.shape == y.shape[:1]:
+        counts = np.broadcast_to(counts.reshape(-1, *(1,) * (y.ndim - 1)), y.shape)
+    if counts.shape != y.shape:
+        raise ValueError(f"valid has shape {counts.shape}: give that of y, {y.shape}")
+    if not (isinstance(grid, int | np.integer) and 1 <= grid <= len(y)):
+        raise ValueError(f"grid is {grid} rows of {len(y)}: give a whole number, or seconds and a sample_rate")
+    check_finite(W, y, counts)
+    if y.ndim == 1:
+        W, y, counts = W[:, None], y[:, None], counts[:, None]
+    return np.where(counts[..., None], W, 0), np.where(counts, y, 0), counts
+
+
+def _white(
+    W: Numbers, y: Numbers, valid: NDArray[np.bool_], noise: Noise | Sequence[Autoregression] | None
+) -> tuple[Numbers, Numbers, NDArray[np.bool_], int]:
+    """White rows, and how many of the given ones there were for each of them."""
+    if noise is None:
+        return W, y, valid, 1
+    if isinstance(noise, Noise):
+        white = whiten(W, y, noise, valid)
+        return white.W, white.y, white.valid, noise.every
+    several = [noise] if isinstance(noise, Autoregression) else list(noise)
+    if len(several) != y.shape[1]:
+        raise ValueError(f"noise has {len(several)} autoregressions for {y.shape[1]} outputs: give one for each")
+    every = max(one.every for one in several)
+    columns = np.concatenate([W, y[..., None]], axis=-1)
+    rows = np.stack([whiten_rows(columns[:, j], valid[:, j], one) for j, one in enumerate(several)], axis=1)[::every]
+    return rows[..., :-1], rows[..., -1], valid[::every], every
+
+
+def _weighed(W: Numbers, y: Numbers, valid: NDArray[np.bool_], step: int) -> tuple[Numbers, Numbers, AnyArray]:
+    """Rows in units of their output's own noise, where there are several outputs."""
+    if y.shape[1] == 1:
+        return W, y, valid
+    size = np.array([float(_scales(_compress(W[:, j], y[:, j], valid[:, j], step)).noise) for j in range(y.shape[1])])
+    return W / size[:, None], y / size, valid
+
+
+def _named(p: int, names: Sequence[str], units: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    names = tuple(names) or tuple(f"theta_{k}" for k in range(p))
+    units = tuple(units) or ("",) * p
+    if len(names) != p or len(units) != p:
+        raise ValueError(f"there are {len(names)} names and {len(units)} units for {p} parameters: give one for each")
+    return names, units

@@ -1,0 +1,125 @@
+"""What is known of parameters that move: a path with a band, and how they move."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaximp.numerics.compilation import require_numbers
+from jaximp.numerics.linear_algebra import root
+from jaximp.results import Column, Result
+from jaximp.types import AnyArray, Numbers
+
+
+class Path(eqx.Module):
+    """Parameters at the G points of a grid, of one record or of several (R, G, ...)."""
+
+    theta: Float[AnyArray, "*R G p"]
+    """In units of the model."""
+    covariance: Float[AnyArray, "*R G p p"]
+    """Of theta."""
+
+    @property
+    def stderr(self) -> Float[AnyArray, "*R G p"]:
+        """Standard deviations."""
+        return root(jnp.diagonal(jnp.asarray(self.covariance), axis1=-2, axis2=-1))
+
+    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
+        """(G, p): lower and upper ends of the bands that hold the truth with probability `level` at each point."""
+        require_numbers("interval", "call it on the results", self, level)
+        if not 0 < level < 1:
+            raise ValueError(f"the level is {level}: it must be a probability between 0 and 1, such as 0.95")
+        half = NormalDist().inv_cdf(0.5 + level / 2) * np.asarray(self.stderr)
+        return np.asarray(self.theta) - half, np.asarray(self.theta) + half
+
+
+class Drift(eqx.Module):
+    """How fast parameters move, by L models with their weights: what is not known of it, too."""
+
+    size: Float[AnyArray, "L p"]
+    """Standard deviation of what a random walk does in one second (without a sample rate, in one row): of a parameter,
+    of its slope, or of the slope's slope, in their units. Zero: the parameter stays where it is."""
+    order: Int[AnyArray, " L"]
+    """Which of them that is: how often it is integrated until it is the parameter."""
+    weight: Float[AnyArray, " L"]
+    """They sum to one."""
+
+    def mean(self, order: int) -> Numbers:
+        """(p,) of the models of one kind; NaN where it is out of the question."""
+        return self._moment(order, 1)
+
+    def stderr(self, order: int) -> Numbers:
+        """(p,) standard deviation over the models of one kind."""
+        return np.sqrt(np.maximum(self._moment(order, 2) - self.mean(order) ** 2, 0))
+
+    def _moment(self, order: int, power: int) -> Numbers:
+        chosen = np.asarray(self.order) == order
+        weight = np.asarray(self.weight)[chosen]
+        if not chosen.any():
+            return np.full(np.shape(self.size)[1], np.nan)
+        return np.asarray(weight @ np.asarray(self.size)[chosen] ** power / weight.sum())
+
+    @property
+    def moves(self) -> Numbers:
+        """(p,) probability that a parameter drifts at all."""
+        return np.asarray(np.asarray(self.weight) @ (np.asarray(self.size) > 0))
+
+
+class Track(eqx.Module, Result):
+    """Parameters along a record, with what is known of how they move."""
+
+    time: Float[AnyArray, " G"]
+    """Middle of the rows that belong to each point [s]; without a sample rate, as an index of rows."""
+    path: Path
+    """What the whole record says (the smoother)."""
+    filtered: Path
+    """What was known up to each point (the filter); drift sizes, and the size of the noise, are those of the record."""
+    jumped: Float[AnyArray, "G p"]
+    """Probability that a parameter jumped in front of this point."""
+    drift: Drift
+    smooth: float
+    """Probability that parameters move smoothly: that their slopes do a random walk, and not they themselves."""
+    noise: float
+    """Standard deviation of the noise in a white row [N m]; in units of each output's own, where there are several."""
+    log_likelihood: float
+    """Of all models together, each with its best scale of the noise."""
+    innovations: Float[AnyArray, "G r"]
+    """What each block says that was not known before, of the most probable model: independent and of unit variance."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    seconds: bool = eqx.field(static=True)
+
+    @property
+    def theta(self) -> Float[AnyArray, "G p"]:
+        """Parameters, from the whole record."""
+        return self.path.theta
+
+    @property
+    def covariance(self) -> Float[AnyArray, "G p p"]:
+        """Of theta."""
+        return self.path.covariance
+
+    @property
+    def value(self) -> Numbers:
+        """(G, p) parameters, from the whole record."""
+        return np.asarray(self.path.theta)
+
+    @property
+    def stderr(self) -> Numbers:
+        """(G, p) standard deviations of theta."""
+        return np.asarray(self.path.stderr)
+
+    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
+        """(G, p): lower and upper ends of the bands that hold the truth with probability `level` at each point."""
+        return self.path.interval(level)
+
+    def columns(self) -> list[Column]:
+        """A row for each point of the grid."""
+        columns = [Column("time_s", "s", self.time) if self.seconds else Column("row", "1", self.time)]
+        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            columns += [Column(name, unit, self.value[:, k]), Column(f"{name}_stderr", unit, self.stderr[:, k])]
+        return columns

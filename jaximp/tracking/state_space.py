@@ -1,0 +1,255 @@
+"""Parameters that move from one point of a grid to the next: what is known of them, as equations.
+
+All that is known of a state x stands in rows `R x = z + noise of unit variance` (d, d + 1): the square root of the
+information matrix, with the right-hand side as its last column. New rows are taken in by an orthogonal transformation;
+what a random step makes less certain is taken off by Potter's formula. Neither subtracts squares: variances cannot
+become negative, a condition number enters once, and where nothing is measured nothing is known.
+
+A record that is read backwards is the same, with the steps undone. What both passes know, joined, is the smoother; and
+what they disagree about is what a jump between them would explain.
+
+The state holds the p parameters, and before them, where they are smooth, what they are integrals of: their slopes, and
+what the slopes are integrals of. Several models, of one record or each of its own, stand side by side along the last
+axis of all arrays: the lanes. Scales are those of `blocks`: parameters of the order of one, noise of variance one.
+
+**Source:** Kalman 1960; Rauch, Tung and Striebel 1965; square roots: Potter 1963, Bierman, Factorization methods for
+discrete sequential estimation, 1977; two passes: Fraser and Potter 1969; jumps: de Jong and Penzer 1998.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaximp.numerics.lanes import inverse_of_rows, substitute
+
+T = TypeVar("T")
+
+PRIOR = 100.0
+"""Standard deviation of parameters before anything is measured, in their own scale."""
+NOTHING = 1e-6
+"""Root of the information behind the record. Of none at all a triangle would have no derivative."""
+
+
+class Motion(eqx.Module):
+    """How the parameters of L models move."""
+
+    walk: Float[Array, "p L"]
+    """Variance of a parameter's own random step."""
+    slope: Float[Array, "p L"]
+    """How far a parameter moves in a step for a slope of one. Zero: it stays where it is."""
+    memory: Float[Array, "p L"]
+    """Points of the grid in which slopes become what they may be before the record."""
+    at: Int[Array, "J L"]
+    """Point of the grid in front of which a jump is; -1 for none."""
+    which: Int[Array, "J L"]
+    """Parameter that jumps."""
+    order: int = eqx.field(static=True)
+    """How many times a random walk, of variance one, is integrated until it is a parameter; without any, parameters do
+    a random walk themselves."""
+
+    def jump_variance(self, k: Array) -> Float[Array, "p L"]:
+        """Of the jumps in front of point k: they are of the size of the parameter, one."""
+        parameters = jnp.arange(len(self.walk))[:, None, None]
+        return ((self.at == k) & (self.which == parameters)).sum(axis=1).astype(self.walk.dtype)
+
+
+class Shocks(NamedTuple):
+    """What a jump of one parameter in front of a point would explain: evidence for its size."""
+
+    score: Float[Array, "p G L"]
+    information: Float[Array, "p G L"]
+
+    def log_odds(self, scale: Array) -> Float[Array, "p G L"]:
+        """Logarithm of the likelihood with a jump of the size of the parameter, over that without; `scale` (L,) squared
+        of the noise."""
+        wider = 1 + self.information
+        return (self.score**2 / wider / scale - jnp.log(wider)) / 2
+
+
+class Evidence(NamedTuple):
+    """The likelihood of a record."""
+
+    log_determinant: Float[Array, " L"]
+    """Sum of the logarithms of what data and prior make of a volume."""
+    squares: Float[Array, " L"]
+    """Of standardised residuals, those inside of blocks not counted."""
+
+    def log_likelihood(self, left: Array, freedom: Array) -> Float[Array, " L"]:
+        """For the best scale of the noise; `left` squares inside of blocks, `freedom` rows less parameters."""
+        return self.log_determinant - freedom / 2 * jnp.log((self.squares + left) / freedom)
+
+
+def triangularise(rows: Float[Array, "m n *L"], pivots: int) -> tuple[Float[Array, "d n *L"], Float[Array, "m k *L"]]:
+    """Upper triangle of the first columns of rows, by modified Gram-Schmidt, and what it leaves of the others.
+
+    Columns need not be independent: a pivot is then zero, or rounding.
+    """
+    triangle: list[Array] = []
+    for _ in range(pivots):
+        column, rows = rows[:, 0], rows[:, 1:]
+        square = (column * column).sum(axis=0)
+        positive = square > 0
+        pivot = jnp.sqrt(jnp.where(positive, square, 1))
+        unit = jnp.where(positive, column / pivot, 0)
+        along = (unit[:, None] * rows).sum(axis=0)
+        rows = rows - unit[:, None] * along
+        nothing = jnp.zeros((len(triangle), *square.shape), rows.dtype)
+        triangle.append(jnp.concatenate([nothing, jnp.where(positive, pivot, 0)[None], along]))
+    return jnp.stack(triangle), rows
+
+
+def start(motion: Motion) -> Float[Array, "d e L"]:
+    """What is known before the record: a diagonal."""
+    root = [motion.memory ** -(0.5 + k) for k in range(motion.order)]
+    diagonal = jnp.concatenate([*root, jnp.full_like(motion.walk, 1 / PRIOR)])
+    d = len(diagonal)
+    return jnp.eye(d, d + 1, dtype=diagonal.dtype)[..., None] * diagonal[:, None]
+
+
+def moved(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Array]:
+    """What is known after a step, and twice the logarithm of what it takes off the determinant."""
+    known = _stepped(known, motion, -1.0)
+    return _less_certain(known, motion, jumps)
+
+
+def _stepped(known: Array, motion: Motion, sign: float) -> Array:
+    """In terms of the state a step later (sign -1) or earlier (+1), but for what is random in it.
+
+    Every integral takes up what it is an integral of, as it was before the step.
+    """
+    p, order = len(motion.walk), motion.order
+    parts = [known[:, k * p : (k + 1) * p] for k in range(order + 1)]
+    for k in range(order) if sign > 0 else reversed(range(order)):
+        share = motion.slope if k == order - 1 else jnp.ones_like(motion.slope)
+        parts[k] = parts[k] + sign * share * parts[k + 1]
+    return jnp.concatenate([*parts, known[:, -1:]], axis=1)
+
+
+def _less_certain(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Array]:
+    """Potter's formula for the random part of a step, one state after the other."""
+    own = motion.walk + jumps
+    one = jnp.ones_like(own[0])
+    random = [] if motion.order == 0 else [(i, one) for i in range(len(own))]
+    random += [(motion.order * len(own) + i, variance) for i, variance in enumerate(own)]
+    lost = jnp.zeros_like(one)
+    for i, variance in random:
+        known, less = widened(known, i, variance)
+        lost = lost + less
+    return known, lost
+
+
+def widened(known: Array, i: int, variance: Array) -> tuple[Array, Array]:
+    """What is known once state i has had a random step of this variance, and what that takes off: see `moved`."""
+    column = known[:, i]
+    share = 1 / (1 + variance * (column * column).sum(axis=0))
+    gain = variance * share / (1 + jnp.sqrt(share))
+    return known - gain * column[:, None] * (column[:, None] * known).sum(axis=0), jnp.log(share)
+
+
+def with_rows(known: Array, rows: Float[Array, "r f *L"]) -> tuple[Array, Array]:
+    """What is known with a block's rows, a triangle, and the squares that it leaves."""
+    triangle, left = triangularise(jnp.concatenate([known, _of_lanes(rows, known)]), len(known))
+    return triangle, (left[:, 0] ** 2).sum(axis=0)
+
+
+def _of_lanes(rows: Float[Array, "r f *L"], known: Array) -> Array:
+    """A block's rows in terms of the whole state, for every lane."""
+    rows = jnp.pad(rows, ((0, 0), (known.shape[1] - rows.shape[1], 0), *((0, 0),) * (rows.ndim - 2)))
+    rows = rows.reshape(*rows.shape, *(1,) * (known.ndim - rows.ndim))
+    return jnp.broadcast_to(rows, (len(rows), *known.shape[1:]))
+
+
+def forward(rows: Float[Array, "G r f *L"], motion: Motion) -> tuple[Evidence, Float[Array, "G d e L"]]:
+    """Kalman's filter over the points of the grid: what the record says of the models, and what was known of each point
+    before its rows."""
+    begin = start(motion)
+
+    def step(carry: tuple[Array, Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
+        (known, lost, squares), (k, block) = carry, now
+        before, less = moved(known, motion, motion.jump_variance(k))
+        known, left = with_rows(before, block)
+        return (known, lost + less, squares + left), before
+
+    nothing = jnp.zeros_like(motion.walk[0])
+    (known, lost, squares), before = jax.lax.scan(step, (begin, nothing, nothing), (jnp.arange(len(rows)), rows))
+    return Evidence(lost / 2 + log_volume(begin) - log_volume(known), squares), before
+
+
+def log_volume(triangle: Array) -> Array:
+    """(L,) logarithm of the determinant of a triangle with a right-hand side."""
+    return jnp.log(jnp.stack([jnp.abs(triangle[i, i]) for i in range(len(triangle))])).sum(axis=0)
+
+
+def evidence(rows: Float[Array, "G r f *L"], motion: Motion) -> Evidence:
+    """What `forward` says of the models, without the path."""
+    return forward(rows, motion)[0]
+
+
+def smoother(
+    rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"]
+) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
+    """Parameters at each point and their covariance, from the whole record; `before` as `forward` gives it."""
+
+    def look(known: Array, _: Array) -> tuple[Array, Array]:
+        theta, root = moments(own_triangle(known, rows.shape[2] - 1))
+        return theta, covariance_of(root)
+
+    return _backward(rows, motion, before, look)
+
+
+def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"]) -> Shocks:
+    """What a jump of each parameter in front of each point would explain; `before` as `forward` gives it."""
+    d, p = before.shape[1], rows.shape[2] - 1
+
+    def look(all_rows: Array, earlier: Array) -> Shocks:
+        # Before a jump by delta, the state was less by it.
+        jump = jnp.zeros((len(all_rows), p, *all_rows.shape[2:]), rows.dtype).at[:d].set(-earlier[:, -p - 1 : -1])
+        whole = jnp.concatenate([all_rows[:, :-1], jump, all_rows[:, -1:]], axis=1)
+        triangle = triangularise(whole, d + p)[0][d:, -p - 1 :]
+        return Shocks((triangle[:, :p] * triangle[:, p:]).sum(axis=0), (triangle[:, :p] ** 2).sum(axis=0))
+
+    return _backward(rows, motion, before, look)
+
+
+def _backward(
+    rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"], look: Callable[[Array, Array], T]
+) -> T:
+    """The record from its end: `look` sees all rows that are known of a point, and those of the points before it."""
+
+    d = before.shape[1]
+
+    def step(behind: Array, now: tuple[Array, Array, Array]) -> tuple[Array, T]:
+        k, block, earlier = now
+        own = _of_lanes(block, behind)
+        seen = look(jnp.concatenate([earlier, own, behind]), earlier)
+        known, _ = triangularise(jnp.concatenate([behind, own]), len(behind))
+        known, _ = _less_certain(known, motion, motion.jump_variance(k))
+        return _stepped(known, motion, 1.0), seen
+
+    nothing = jnp.broadcast_to(NOTHING * jnp.eye(d, d + 1, dtype=rows.dtype)[..., None], before.shape[1:])
+    return jax.lax.scan(step, nothing, (jnp.arange(len(rows)), rows, before), reverse=True)[1]
+
+
+def own_triangle(known: Float[Array, "m e *K"], p: int) -> Float[Array, "p f *K"]:
+    """Of the parameters alone, from all that is known of the state."""
+    return triangularise(known, known.shape[1] - 1)[0][-p:, -p - 1 :]
+
+
+def moments(triangle: Float[Array, "p f *K"]) -> tuple[Float[Array, "p *K"], Float[Array, "p p *K"]]:
+    """Parameters and a root of their covariance, `root @ root'`, from their triangle."""
+    p, shape = len(triangle), triangle.shape[2:]
+    flat = triangle.reshape(p, p + 1, -1)
+    rows = tuple(flat[i, i:] for i in range(p))
+    root = inverse_of_rows(tuple(row[:-1] for row in rows))
+    return jnp.stack(substitute(rows, p)).reshape(p, *shape), root.reshape(p, p, *shape)
+
+
+def covariance_of(root: Float[Array, "p p *K"]) -> Float[Array, "p p *K"]:
+    """`root @ root'`."""
+    return (root[:, None] * root).sum(axis=2)
