@@ -31,7 +31,7 @@ MANY_MAPS = 20_000
 
 def pytest_configure(config: pytest.Config) -> None:
     """What takes long to compile is compiled once: for all workers, and for all processes that tests start."""
-    gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, few of them garbage
+    gc.set_threshold(20_000, 10, 10)  # tracing makes many objects, few of them garbage
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         config.stash[STORE] = Path(tempfile.mkdtemp(prefix="jaximp-tests-"))
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.stash[STORE])
