@@ -11,7 +11,7 @@ from jaximp.consistency.barrier import distance_to_robots
 from jaximp.consistency.cone import pose
 from jaximp.identification.estimates import Estimates
 from jaximp.identification.prepared import Prepared
-from jaximp.identification.whole import of_whole_recording, solved_rows
+from jaximp.identification.whole import solved_rows
 from jaximp.models.chain import Chain
 from jaximp.trust.window_rules import OF_LINKS
 from jaximp.types import Numbers
@@ -29,13 +29,16 @@ HEAVY = 0.1
 POSES = 200
 
 
-def judged_as_robot(prepared: Prepared, estimates: Estimates) -> Estimates:
-    """With what the rules look at of a robot from a URDF. The estimates of anything else stay as they are."""
+def judged_as_robot(prepared: Prepared, estimates: Estimates, theta: Numbers) -> Estimates:
+    """With what the rules look at of a robot from a URDF. The estimates of anything else stay as they are.
+
+    **Arguments:** `theta` (p,) of the recording as a whole.
+    """
     chain = prepared.model
     if not isinstance(chain, Chain):
         return estimates
     out_of_reach, note = _reach(chain, prepared.recording.position)
-    held_out, theta = estimates.held_out, of_whole_recording(prepared, estimates.value)
+    held_out = estimates.held_out
     look = partial(
         replace,
         of_robot=True,
@@ -87,6 +90,7 @@ def _opposed(prepared: Prepared, chain: Chain, theta: Numbers) -> str:
 def _reach(chain: Chain, position: Numbers) -> tuple[str, str]:
     """Which joint is so far out that it cannot be; or, as a note, which ones are beyond the URDF's limits."""
     lower, upper = chain.limits.lower, chain.limits.upper
+    position = np.asarray(chain.limited_positions(position))
     with np.errstate(invalid="ignore"):
         least, most = np.nanmin(position, axis=0), np.nanmax(position, axis=0)
         beyond = np.nan_to_num(np.maximum(lower - least, most - upper) / (upper - lower), neginf=0.0)

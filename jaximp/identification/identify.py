@@ -33,6 +33,7 @@ from jaximp.identification.whole import of_whole_recording
 from jaximp.least_squares.sliding import score, sliding_least_squares
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Joints, combine
+from jaximp.models.chain import Chain
 from jaximp.models.reflex import with_gain
 from jaximp.trust.score_tests import Misfit
 from jaximp.types import Progress, Recording, RobotAlone, nearest
@@ -98,12 +99,14 @@ def in_windows(
     found = _in_windows(prepared, progress, longest, curves)
     if prepared.pair is not None or not prepared.pipeline.once:
         return found
-    if not curves:
-        return [judged_as_robot(prepared, found[0])]
+    if not curves and not isinstance(prepared.model, Chain):
+        return found
     theta = of_whole_recording(prepared, found[0].value)
+    if not curves:
+        return [judged_as_robot(prepared, found[0], theta)]
     held_out = None if prepared.held_out is None else Residuals.of(prepared.held_out, theta)
     residuals = Residuals.of(prepared.rows, theta)
-    return [judged_as_robot(prepared, replace(found[0], residuals=residuals, held_out=held_out))]
+    return [judged_as_robot(prepared, replace(found[0], residuals=residuals, held_out=held_out), theta)]
 
 
 def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, curves: bool) -> list[Estimates]:

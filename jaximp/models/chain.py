@@ -309,6 +309,10 @@ class Chain(Model):
         """Positions of all joints that move, as the URDF means them, from the recorded ones."""
         return jnp.asarray(q) @ jnp.asarray(self.tree.coordinates).T + jnp.asarray(self.tree.zero)
 
+    def limited_positions(self, q: Num[ArrayLike, "... n"]) -> Float[Array, "... n"]:
+        """Positions of `joint_names` as the URDF counts them, and as its `limits` hold for them."""
+        return self.joint_positions(q)[..., list(self._leaders)]
+
     def inverse_dynamics(
         self, q: Num[ArrayLike, "..."], dq: Num[ArrayLike, "..."], ddq: Num[ArrayLike, "..."]
     ) -> Float[Array, "..."]:

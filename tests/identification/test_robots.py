@@ -208,6 +208,16 @@ def test_a_position_a_little_out_of_reach_is_said(chain: Chain, pipeline: Pipeli
     assert "lets it move" not in found.verdicts.reason[0]
 
 
+def test_positions_of_motors_are_within_reach_by_their_joints(chain: Chain, tmp_path: Path) -> None:
+    """Motors turn fifty times as far as the joints, one of them backwards and from another zero."""
+    known, geared = recording(chain, 1), {"gear": 50.0, "side": "motor", "sign": [1, -1], "zero": [0.0, 0.4]}
+    at_motors = (known.position - [0.0, 0.4]) * [50.0, -50.0]
+    turned = replace(known, position=at_motors, torque=known.torque * [0.02, -0.02], position_noise=None)
+    (found,) = estimate(Pipeline(100.0, chain_in(tmp_path, **geared), filter=FILTER), turned)
+    assert found.verdicts.trusted.all()
+    assert not any("lets it move" in note for note in found.notes)
+
+
 def test_windows_of_a_length_slide_over_a_chain(chain: Chain) -> None:
     sliding = Pipeline(100.0, chain, WindowSettings(8.0, 4.0), FILTER)
     found = estimate(sliding, recording(chain, 5))[0]
