@@ -125,7 +125,9 @@ class Plan:
         which += [] if model.chain is None else [f"robot of {model.chain.urdf}"]
         which += [] if model.tip is None else ["human who holds its end"]
         methods = f", methods {', '.join(map(str, model.methods))}" if len(which) == 2 else ""
-        every = f"windows of {job.window.length:g} s every {job.window.step_seconds:g} s"
+        every = f"windows of {job.window.length:g} s every {job.step_seconds:g} s"
+        if job.track is not None:
+            every = f"followed at points every {job.step_seconds:g} s"
         windows = "each recording as one window" if math.isinf(job.window.length) else every
         lines.append(f"model: {' and '.join(which)}{methods}; {windows}")
         counts = Counter((batch.padded, batch.stacked) for batch in self.batches for _ in batch.items)
@@ -146,7 +148,7 @@ def expected_bytes(job: WindowJob, plan: Plan) -> float:
     """Size of the results, as it was measured; windows are counted at the rate that the job states, or at 1 kHz."""
     rate = job.recording.get("sample_rate")
     rate = float(rate) if isinstance(rate, int | float) else 1000.0
-    length, step = job.window.length, job.window.step_seconds
+    length, step = job.window.length, job.step_seconds
     many = sum(max(0, (item.samples / rate - length) / step + 1) for item in plan.items if math.isfinite(length))
     windows = many if math.isfinite(length) else len(plan.items)
     files = sum(len({item.partition(plan.partitions) for item in batch.items}) for batch in plan.batches)

@@ -96,7 +96,7 @@ class Result:
     @property
     def remark(self) -> str:
         """Why it failed, or else why none of its windows can be trusted."""
-        return self.estimates[0].verdicts.complaint() if self.estimates else self.reason
+        return self.estimates[0].verdicts.complaint(self.estimates[0].kind) if self.estimates else self.reason
 
 
 def checksum(content: bytes) -> str:

@@ -72,7 +72,7 @@ def _how_loose(estimates: Estimates, share: float) -> str:
     if isinstance(estimates.model, Chain):
         return f": half of its interval is {share:.0%} of its size"
     times = f"{share:.0%} of it" if share < 1 else f"{share:.2g} times as large"
-    return f": its standard error in one window is {times}"
+    return f": its standard error in one {estimates.kind} is {times}"
 
 
 def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
@@ -93,11 +93,13 @@ def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
 
 def _say_result(estimates: Estimates) -> None:
     counts = {name: count for name, count in estimates.verdicts.counts().items() if count}
-    typer.echo("windows: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    kind = estimates.kind
+    typer.echo(f"{kind}s: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
     unpredictive = int(estimates.unpredictive.sum())
     if unpredictive:
-        typer.echo(f"of the trusted, {unpredictive} predict the torque of the next window worse than a constant would")
-    complaint, shown = estimates.verdicts.complaint(), estimates.summarised()
+        ahead = "of the next window " * (kind == "window") + "worse than a constant would"
+        typer.echo(f"of the trusted, {unpredictive} predict the torque {ahead}")
+    complaint, shown = estimates.verdicts.complaint(kind), estimates.summarised()
     if complaint:
         typer.echo(complaint)
     for where, found in (("recording", estimates.residuals), ("held out", estimates.held_out)):
@@ -109,7 +111,7 @@ def _say_result(estimates: Estimates) -> None:
     one, width = len(shown.end) == 1, max(20, *map(len, shown.names))
     low, high = shown.interval()
     halves = (high[0] - low[0]) / 2
-    typer.echo("95 % intervals:" if one else "mean and standard deviation over the trusted windows:")
+    typer.echo("95 % intervals:" if one else f"mean and standard deviation over the trusted {kind}s:")
     for name, unit, mean, sd, half in zip(shown.names, shown.units, means, sds, halves, strict=True):
         spread = f"± {half:.2g}" if one else f"({sd:.2g})"
         said = f"{mean:11.4g} {spread} {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"

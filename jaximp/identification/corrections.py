@@ -104,11 +104,11 @@ def window_sums(W: AnyArray, valid: AnyArray, fit: SlidingFit) -> Sums:
     return Sums(gram, moment, over_windows(valid.sum(axis=1).astype(float)))
 
 
-def corrected(fit: SlidingFit, W: AnyArray, noisy: AnyArray | None, valid: AnyArray, apart: int) -> SlidingFit:
+def corrected(fit: SlidingFit, W: AnyArray, noisy: AnyArray | None, valid: AnyArray, apart: int | None) -> SlidingFit:
     """Estimates and standard errors without what is known to move them.
 
     **Arguments:** rows `W` (N, *n, p) of the `fit`, and what noise of the position makes of them, `noisy` (N, *n, p);
-    `valid` (N, *n); windows `apart` of each other share no rows.
+    `valid` (N, *n); windows `apart` of each other share no rows (None leaves change inside of them as it is).
     """
     sums = window_sums(W, valid, fit)
     known = np.isfinite(np.asarray(fit.theta)).all(axis=1) & (np.asarray(fit.stderr) > 0).all(axis=1)
@@ -118,8 +118,9 @@ def corrected(fit: SlidingFit, W: AnyArray, noisy: AnyArray | None, valid: AnyAr
     theta, stderr = np.array(fit.theta), np.array(fit.stderr)
     if noisy is not None:
         theta[known], stderr[known] = _without_noise(theta[known], stderr[known], _some(sums, known), noisy, valid)
-    moved, variance = _without_change(theta, stderr, sums, known, apart, _share_of_distance(fit, apart))
-    theta, stderr = theta - moved, np.sqrt(stderr**2 + variance)
+    if apart is not None:
+        moved, variance = _without_change(theta, stderr, sums, known, apart, _share_of_distance(fit, apart))
+        theta, stderr = theta - moved, np.sqrt(stderr**2 + variance)
     return eqx.tree_at(lambda f: (f.theta, f.stderr), fit, (theta, stderr))
 
 

@@ -20,6 +20,7 @@ from jaximp.models.determined import DETERMINED, openness, sizes_of_chain
 from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.models.tip import TipImpedance
 from jaximp.results import Column, Result
+from jaximp.tracking.results import Track
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit
@@ -132,6 +133,9 @@ class Estimates(Result):
     """What they leave of a recording that they have not seen, where there is one."""
     doubted: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Of a model whose parameters are judged one by one, (M,) why each cannot be trusted; empty text where it can."""
+    tracks: tuple[Track, ...] = ()
+    """Of each joint the path of its parameters, where they were followed: the M estimates are its points then, and
+    `window` is the length of the stretch around each in which its motion is judged."""
 
     @property
     def value(self) -> NDArray[np.float64]:
@@ -163,8 +167,14 @@ class Estimates(Result):
         return self.verdicts.trusted
 
     @property
+    def kind(self) -> str:
+        """What each of the M estimates belongs to: a `window`, or a `point` of a path."""
+        return "point" if self.tracks else "window"
+
+    @property
     def unpredictive(self) -> NDArray[np.bool_]:
-        """(M,) trusted windows whose parameters predict the torque of the next one worse than a constant would."""
+        """(M,) trusted windows whose parameters predict the torque of the next one worse than a constant would; of a
+        path those where what was known before does."""
         return np.asarray(self.trusted & (self.held_out_vaf < 0))
 
     def trusted_in(self, name: str) -> NDArray[np.bool_]:
@@ -227,6 +237,7 @@ class Estimates(Result):
                 Column(f"{reflex.name}_gain_stderr", reflex.unit, reflex.gain_stderr),
                 Column(f"{reflex.name}_delay", "s", reflex.delay),
             ]
+        columns += self._columns_of_path()
         return [
             *columns,
             Column("condition", "1", fit.cond),
@@ -239,6 +250,22 @@ class Estimates(Result):
             Column("verdict", "", self.verdicts.verdict),
             Column("reason", "", self.verdicts.reason),
         ]
+
+    def _columns_of_path(self) -> list[Column]:
+        """Where parameters were followed: what was known up to each point, and how probable a jump in front of it is.
+        Other parts of a table stand for the whole record."""
+        columns, k = [], 0
+        for track in self.tracks:
+            theta, stderr = np.asarray(track.filtered.theta), np.asarray(track.filtered.stderr)
+            for i in range(theta.shape[1]):
+                name, unit = self.names[k], self.units[k]
+                columns += [
+                    Column(f"{name}_filtered", unit, theta[:, i]),
+                    Column(f"{name}_filtered_stderr", unit, stderr[:, i]),
+                    Column(f"{name}_jump", "1", np.asarray(track.jumped)[:, i]),
+                ]
+                k += 1
+        return columns
 
     @cached_property
     def verdicts(self) -> Verdicts:

@@ -20,6 +20,7 @@ from jaximp.identification.estimates import Estimates, Reflex
 from jaximp.identification.judging import judge
 from jaximp.identification.misfit import find_human_misfits, find_misfits
 from jaximp.identification.pipeline import Pipeline, ReferenceMotion
+from jaximp.identification.points import Followed, follow, part_of
 from jaximp.identification.prepared import Pair, Prepared, columns_by_joint, prepare, whitener, with_windows
 from jaximp.identification.residuals import Residuals
 from jaximp.identification.robot_changes import OTHER_METHODS, Doubts, Sameness
@@ -116,8 +117,9 @@ def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, c
     rows = prepared.rows
     place = place_windows(prepared.pipeline, rows, longest)
     if prepared.solved:
-        misfits = _misfits(prepared, prepared.solved[0].fit)
-        return [judge(prepared, rows, prepared.solved[0], place, curves=curves, misfits=misfits)]
+        solved = prepared.solved[0]
+        misfits, followed = _misfits(prepared, solved.fit), _followed(prepared, solved)
+        return [judge(prepared, rows, solved, place, curves=curves, misfits=misfits, followed=followed)]
     if prepared.pair is not None:
         return _by_methods(prepared, prepared.pair, place, progress, curves)
 
@@ -145,7 +147,32 @@ def _in_windows(prepared: Prepared, progress: Progress, longest: float | None, c
             fit, beside = from_white(fit, as_filtered, white, seen), as_filtered
             gain = None if gain is None else from_white(gain, as_filtered, replace(white, inflation=np.ones(1)))
     solved, misfits = _predict(rows, fit, place)._replace(beside=beside), _misfits(prepared, fit)
-    return [judge(prepared, rows, solved, place, gain=gain, curves=curves, misfits=misfits)]
+    followed = _followed(prepared, solved)
+    return [judge(prepared, rows, solved, place, gain=gain, curves=curves, misfits=misfits, followed=followed)]
+
+
+def _followed(prepared: Prepared, solved: Solved) -> Followed | None:
+    """The path of the parameters of one model alone, where it is asked for."""
+    settings, model = prepared.pipeline.track, prepared.model
+    if settings is None:
+        return None
+    still = [name in settings.stays for name in model.names]
+    found = follow(prepared.pipeline, prepared.white[0], prepared.rows.valid, model.names, model.units, still)
+    return Followed(*found, np.asarray(solved.fit.stderr))
+
+
+def _followed_by_method(prepared: Prepared, found: Separation) -> Followed | None:
+    """The path of a human's parameters in a robot's recording, whose own stay as they are."""
+    settings, model, white = prepared.pipeline.track, prepared.model, found.white
+    if settings is None or white is None:
+        return None
+    names = [f"robot_{k}" for k in range(white.W.shape[-1])]
+    for column, name in zip(found.human, model.names, strict=True):
+        names[column] = name
+    still = [name not in model.names or name in settings.stays for name in names]
+    whole, mixed = follow(prepared.pipeline, white, found.valid, names, [""] * len(names), still)
+    human = part_of(whole, found.human, model.names, model.units, np.asarray(found.shared))
+    return Followed(human, mixed, np.asarray(found.own))
 
 
 def _misfits(prepared: Prepared, fit: SlidingFit) -> tuple[Misfit, ...]:
@@ -205,9 +232,9 @@ def _by_methods(prepared: Prepared, pair: Pair, place: Placement, progress: Prog
             noisy = found.white.apply(rows.noisy[:n, len(pair.robot.names) :], rows.valid[:n])
             own = replace(prepared, column_noise=np.sqrt((noisy**2).mean(axis=0)))
         misfits = _human_misfits(prepared, pair, found, method)
-        estimates = judge(
-            own, human, solved, place, method, *notes, gain=gain, curves=curves, misfits=misfits, doubts=doubts
-        )
+        followed = _followed_by_method(prepared, found)
+        judged = partial(judge, gain=gain, curves=curves, misfits=misfits, doubts=doubts, followed=followed)
+        estimates = judged(own, human, solved, place, method, *notes)
         may_change = np.sqrt(np.diagonal(pair.change))
         of_robot = replace(estimates, robot=pair.robot_fit, robot_names=pair.robot.names, robot_change=may_change)
         results.append(replace(of_robot, method=method))
@@ -269,10 +296,15 @@ def _one_joint(prepared: Prepared, model: Joints, j: int, columns: slice) -> Pre
     recording, pipeline, this = prepared.recording, prepared.pipeline, slice(j, j + 1)
     tag = f"joint{j + 1}."
     chosen = tuple(name.removeprefix(tag) for name in pipeline.limits.parameters if name.startswith(tag))
+    track = pipeline.track
+    if track is not None:
+        track = replace(track, stays=tuple(name.removeprefix(tag) for name in track.stays if name.startswith(tag)))
     return replace(
         prepared,
         recording=recording.of_joint(j),
-        pipeline=replace(pipeline, model=model.models[j], limits=pipeline.limits.of_joint(j, parameters=chosen)),
+        pipeline=replace(
+            pipeline, model=model.models[j], limits=pipeline.limits.of_joint(j, parameters=chosen), track=track
+        ),
         rows=prepared.rows.of_joint(j, columns),
         column_noise=prepared.column_noise[columns],
         reference=_of_joint(prepared.reference, this),
@@ -335,6 +367,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         predicted=np.concatenate([part.predicted for part in parts], axis=1),
         notes=tuple(_notes_side_by_side(parts)),
         reflexes=tuple(_reflexes_side_by_side(parts)),
+        tracks=tuple(one for part in parts for one in part.tracks),
     )
 
 
@@ -359,9 +392,9 @@ OTHER_LENGTHS = (0.5, 2.0)
 
 
 def longest_of(prepared: Prepared) -> float | None:
-    """The longest of these windows [s]; none where a window is the whole recording."""
+    """The longest of these windows [s]; none where a window is the whole recording, or a path needs none."""
     pipeline = prepared.pipeline
-    return None if _is_whole(prepared) else max(OTHER_LENGTHS) * pipeline.window.length
+    return None if _is_whole(prepared) or pipeline.track is not None else max(OTHER_LENGTHS) * pipeline.window.length
 
 
 def _is_whole(prepared: Prepared) -> bool:
@@ -376,10 +409,11 @@ def at_other_lengths(
 ) -> list[Estimates]:
     """The same data with shorter and longer windows, by the first method, so that the choice of a length can be seen.
 
-    Lengths that the recording or the filters do not allow are left out; a window that is the whole recording has none.
+    Lengths that the recording or the filters do not allow are left out; a window that is the whole recording has none,
+    nor has a path.
     """
     length = prepared.pipeline.window.length
-    if _is_whole(prepared):
+    if longest_of(prepared) is None:
         return []
 
     def identified(factor: float) -> list[Estimates]:

@@ -30,6 +30,7 @@ from jaximp.identification.misfit import (
     unnoticed,
 )
 from jaximp.identification.pipeline import FREELY, Pipeline
+from jaximp.identification.points import Followed, moves_in_words, points_of_path, points_of_windows, windows_apart
 from jaximp.identification.prepared import Prepared, has_instruments
 from jaximp.identification.robot_changes import NO_DOUBTS, Doubts
 from jaximp.identification.rows import Rows
@@ -59,8 +60,6 @@ from jaximp.types import Numbers, Recording
 
 CLEAR = 2.0
 """A reflex whose gain is so many standard errors from zero has a delay."""
-STILL = 1e-3
-"""A window whose torque varies by a smaller share of the recording's variance can neither confirm nor refute."""
 
 
 def judge(
@@ -74,27 +73,34 @@ def judge(
     curves: bool = True,
     misfits: tuple[Misfit, ...] = (),
     doubts: Doubts = NO_DOUBTS,
+    followed: Followed | None = None,
 ) -> Estimates:
     """Measure all that the rules look at; `Estimates.verdicts` applies them. `gain`: the fit that `with_gain` makes;
-    `doubts` beside what the model lacks."""
+    `doubts` beside what the model lacks; `followed`, a path whose points stand in place of the windows."""
     pipeline, model = prepared.pipeline, prepared.model
     solved = solved._replace(fit=_judged_by_the_human(pipeline, rows, solved.fit, place, method))
-    fit, starts = _corrected(prepared, rows, solved.fit, place), place.starts[: len(solved.fit.last)]
-    held_out = _held_out(solved)
-    threshold, why_not = _threshold(prepared, place, method)
+    fit, starts = _corrected(prepared, rows, solved.fit, place, followed is None), place.starts[: len(solved.fit.last)]
+    threshold, why_not = (None, "") if followed is not None else _threshold(prepared, place, method)
     reflexes = () if gain is None else (_reflex(model, fit, gain),)
     weights = {model.names[k] for reflex in reflexes for k in reflex.columns}
     limits = _limits(pipeline, weights)
     judged = judged_names(model, limits)
     of_model = _OfModel.of(model, solved, misfits, place, judged, pipeline.ordinary, weights)
     of_model = of_model.with_drive(prepared.drive, model.names, judged, fit, place)
-    of_model = of_model.with_gain(gain_in_words(model, fit, _apart(place)), judged)
+    of_model = of_model.with_gain(gain_in_words(model, fit, windows_apart(place)), judged)
     of_model = of_model.with_doubts(doubts, judged)
     sure, fit = fit, with_common_errors(prepared, rows, _with_open_moves(fit, of_model.moves), place)
+    if followed is None:
+        points = points_of_windows(rows, fit, solved, place, curves)
+    else:
+        moved = np.asarray(sure.theta) - np.asarray(solved.fit.theta)
+        points = points_of_path(rows, fit, moved, solved, place, followed, curves)
+    fit, apart = points.fit, points.apart
     full, scale = place.counted * model.n_joints, solved.moments.parameter_scale
     measure = partial(measure_windows, fit, model.names, model.roles, full, scale, prepared.column_noise, threshold)
     measured, doubted = measure(limits), {}
-    at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[np.asarray(fit.last)])
+    at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[starts + place.window - 1])
+    at_limit = np.broadcast_to(at_limit, starts.shape)[points.window]
     measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy, at_limit=at_limit)
     measured = _against_other_people(measured, model, fit, limits)
     if is_chain(model.roles):
@@ -104,10 +110,12 @@ def judge(
             for name, one in each.items()
         }
         doubted = {name: judge_windows(one, limits).reason for name, one in each.items()}
-    measured = judge_together(measured, fit, model.roles, held_out, _apart(place), limits)
-    side_by_side = _apart(place) * np.flatnonzero(excited_windows(measured, limits)[:: _apart(place)])
-    reconstructed, predicted, shown = _reconstruct(rows, fit, starts, place, curves)
-    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[shown].reshape(reconstructed.shape)
+    # Points of a path are no independent estimates: they do not speak together of a mass below zero.
+    together = model.roles if followed is None else ()
+    measured = judge_together(measured, fit, together, points.held_out, apart, limits)
+    torque = np.where(np.asarray(rows.valid), np.asarray(rows.torque), np.nan)[points.shown]
+    torque = torque.reshape(points.reconstructed.shape)
+    start, end = rows.time[np.asarray(fit.first)], rows.time[np.asarray(fit.last)]
     about = (
         jump_note(prepared.recording, prepared.jumps),
         _literal_note(pipeline),
@@ -119,32 +127,41 @@ def judge(
         *notes,
         _drive_note(prepared, misfits, np.asarray(solved.fit.theta)),
     )
-    changed = changes(pipeline, sure, side_by_side, rows.time[starts], rows.time[np.asarray(fit.last)])
+    if followed is not None:
+        changed = moves_in_words(points.tracks[0], judge_windows(measured, limits).trusted)
+    else:
+        side_by_side = apart * np.flatnonzero(excited_windows(measured, limits)[::apart])
+        changed = changes(pipeline, sure, side_by_side, start, end)
     estimates = Estimates(
         model=model,
         names=model.names,
         units=model.units,
         window=pipeline.window.length,
-        start=rows.time[starts],
-        end=rows.time[np.asarray(fit.last)],
+        start=start,
+        end=end,
         fit=fit,
-        held_out_vaf=held_out,
+        held_out_vaf=points.held_out,
         measured=(measured,),
         limits=pipeline.limits,
         threshold=threshold,
-        time=rows.time[shown],
+        time=rows.time[points.shown],
         torque=torque,
-        reconstructed=reconstructed,
-        predicted=predicted,
-        notes=(*prepared.recording.notes, *filter(None, about), *_changes_in_words(pipeline, changed)),
+        reconstructed=points.reconstructed,
+        predicted=points.predicted,
+        notes=(
+            *prepared.recording.notes,
+            *filter(None, about),
+            *_changes_in_words(pipeline, changed, followed is not None),
+        ),
         changed=changed,
         reflexes=reflexes,
         misfits=misfits,
         bands=of_model.bands,
         frequencies=by_frequency(pipeline, rows, prepared.white) if misfits and curves else (),
-        noise=_noise_spectra(prepared, torque - reconstructed) if curves else (),
+        noise=_noise_spectra(prepared, torque - points.reconstructed) if curves else (),
         lacking={name: text for name, text in of_model.lacking.items() if name not in weights},
         doubted=doubted,
+        tracks=points.tracks,
     )
     of_reflexes = tuple(_reflex_note(reflex, estimates.verdicts.trusted) for reflex in reflexes)
     return replace(estimates, notes=estimates.notes + of_reflexes) if of_reflexes else estimates
@@ -162,9 +179,9 @@ def _judged_by_the_human(
     return eqx.tree_at(lambda f: (f.vaf, f.residual_rms, f.samples), fit, quality)
 
 
-def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement) -> SlidingFit:
+def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement, changing: bool) -> SlidingFit:
     """Where the torque's noise is estimated: without what noise of the position, own motion of a free joint and change
-    inside windows do."""
+    inside windows do; that not, where they are not `changing` (a path has no windows)."""
     if len(prepared.white) != 1:
         return fit
     solved = (prepared.weighted or rows) if prepared.pipeline.ordinary else prepared.white[0]
@@ -174,7 +191,7 @@ def _corrected(prepared: Prepared, rows: Rows, fit: SlidingFit, place: Placement
         both = both if prepared.pipeline.ordinary else prepared.white[0].apply(both, rows.valid)
         given = (both[:, :-1], both[:, -1], np.asarray(solved.W), np.asarray(solved.torque))
         fit = in_windows_of(fit, *given, np.asarray(rows.valid))
-    return corrected(fit, solved.W, solved.noisy, rows.valid, _apart(place))
+    return corrected(fit, solved.W, solved.noisy, rows.valid, windows_apart(place) if changing else None)
 
 
 def _with_open_moves(fit: SlidingFit, moves: Numbers) -> SlidingFit:
@@ -182,12 +199,6 @@ def _with_open_moves(fit: SlidingFit, moves: Numbers) -> SlidingFit:
     if not moves.any():
         return fit
     return eqx.tree_at(lambda f: f.stderr, fit, jnp.sqrt(jnp.asarray(fit.stderr) ** 2 + moves**2))
-
-
-def _held_out(solved: Solved) -> NDArray[np.float64]:
-    """(M,) how each window predicts the next; NaN where that one hardly has a torque."""
-    unseen = solved.unseen
-    return np.where(np.asarray(unseen.variance) > STILL * solved.moments.torque, np.asarray(unseen.vaf), np.nan)
 
 
 def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limits: TrustLimits) -> Windows:
@@ -202,7 +213,9 @@ def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limi
     return replace(measured, impedance=theta, outside=outside)
 
 
-def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str]) -> list[str]:
+def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str], of_path: bool) -> list[str]:
+    if of_path:
+        return [f"{name} moves: {how}" for name, how in changed.items()]
     doubt = "" if pipeline.whitens else "; or its errors are too small, since the noise was taken as white"
     return [f"{name} is not the same in all windows: {when}{doubt}" for name, when in changed.items()]
 
@@ -249,13 +262,6 @@ def _limits(pipeline: Pipeline, weights: set[str]) -> TrustLimits:
     return replace(limits, parameters=tuple(name for name in kept if name not in weights))
 
 
-def _apart(place: Placement) -> int:
-    """Windows so far from each other share no rows."""
-    if place.separate:
-        return max(1, int(place.next_starts[0] // place.window))
-    return -(-place.window // place.step)
-
-
 def _noise_spectra(prepared: Prepared, left: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Of the noise that was estimated, by what the estimates leave (N, n) of the torque."""
     if not prepared.white:
@@ -291,7 +297,7 @@ class _OfModel:
     ) -> _OfModel:
         """**Arguments:** whether the estimates are `ordinary`, and the others beside them are not; `weights` of a
         reflex, of which nothing is said one by one."""
-        apart, bands = _apart(place), None
+        apart, bands = windows_apart(place), None
         theta, stderr = (np.asarray(x) for x in (solved.fit.theta, solved.fit.stderr))
         size = sizes(np.abs(_middle(theta)), model.roles) if misfits else np.zeros(0)
         if solved.beside is not None and misfits:
@@ -319,7 +325,7 @@ class _OfModel:
         refused, and the errors of what may be off by less grow."""
         if drive is None or not (drive.failed or drive.off is not None):
             return self
-        theta, stderr = (np.asarray(x)[:: _apart(place)] for x in (fit.theta, fit.stderr))
+        theta, stderr = (np.asarray(x)[:: windows_apart(place)] for x in (fit.theta, fit.stderr))
         found = drive.off_by(names, np.abs(_middle(theta)), _error_of_mean(stderr))
         lacking = {name: f"{MOVED}: {text}" for name, text in found.items()}
         said = [text for name, text in found.items() if name in judged]
@@ -472,31 +478,3 @@ def _threshold(prepared: Prepared, place: Placement, method: int | None) -> tupl
     W = prepared.model.over_period(q, dq, ddq, rate).reshape(-1, len(prepared.model.names))
     window = round(prepared.pipeline.window.length * rate * place.counted / place.window)
     return float(fake_change_threshold(np.asarray(W), len(q), window)), ""
-
-
-def _reconstruct(
-    rows: Rows, fit: SlidingFit, starts: NDArray[np.int64], place: Placement, wanted: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """The model's torque with seen and unseen parameters, and which rows it is shown for."""
-    W, theta = np.asarray(rows.W), np.asarray(fit.theta)
-    times, window = rows.time, place.window
-    if not wanted:
-        none = np.empty((0, int(np.prod(W.shape[1:-1]))))
-        return none, none, np.empty(0, np.int64)
-    if place.separate:  # windows hold copies of the same samples: show each sample once, from non-overlapping windows
-        chosen, end = [], -np.inf
-        for k, first in enumerate(starts):
-            if times[first] > end:
-                chosen.append(k)
-                end = times[first + window - 1]
-        shown = np.concatenate([np.arange(starts[k], starts[k] + window) for k in chosen])
-        around = np.repeat(chosen, window)
-        unseen = np.repeat([-1, *chosen[:-1]], window)
-    else:
-        shown = np.arange(len(W))
-        around = np.searchsorted(starts + window / 2, shown).clip(0, len(starts) - 1)
-        unseen = np.searchsorted(starts + window, shown - shown % window, side="right") - 1
-    reconstructed = np.einsum("k...p,kp->k...", W[shown], theta[around])
-    predicted = np.einsum("k...p,kp->k...", W[shown], theta[unseen])
-    predicted[unseen < 0] = np.nan
-    return reconstructed.reshape(len(shown), -1), predicted.reshape(len(shown), -1), shown

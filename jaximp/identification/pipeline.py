@@ -24,6 +24,8 @@ ESTIMATES = ["generalised", "ordinary"]
 """Choices of `WindowSettings.estimates`."""
 IMPOSED, FREELY = DRIVES = ["position", "free"]
 """Choices of `Pipeline.drive`."""
+STRETCH = 2.0
+"""Length of the stretches in which motion and noise are judged around each point of a path, where none is given [s]."""
 ReferenceMotion = tuple[AnyArray, AnyArray, AnyArray] | str
 """Position, velocity, acceleration (P, n) of one period of the reference motion, or why there is none."""
 
@@ -56,6 +58,21 @@ class WindowSettings:
 
 
 @dataclass(frozen=True)
+class TrackSettings:
+    """Parameters that are followed as they move (`jaximp.track`), in place of windows.
+
+    How fast each of them moves comes from the recording: not at all, smoothly, or in jumps.
+    """
+
+    grid: float = 0.05
+    """From one point of the path to the next [s]."""
+    stays: tuple[str, ...] = ()
+    """Parameters that are known not to move, such as the inertia of a limb."""
+    jumps: bool = True
+    """Whether parameters may also change at once."""
+
+
+@dataclass(frozen=True)
 class Pipeline:
     """From a recording to verdicts: all that is decided before its first sample is looked at.
 
@@ -81,6 +98,9 @@ class Pipeline:
     drive: str | None = None
     """`position` where the motion is imposed; `free` where the joint's own torque moves it too; None takes the first,
     and says so."""
+    track: TrackSettings | None = None
+    """Whether parameters are followed as they move. Windows are then the stretches around each point in which the noise
+    is estimated and the motion judged."""
 
     @property
     def filters(self) -> Filters:
@@ -125,7 +145,12 @@ class Pipeline:
         return math.isinf(self.window.length)
 
     def of_length(self, samples: int) -> Pipeline:
-        """With the window of a recording of so many samples, where it is the whole recording."""
+        """With the window of a recording of so many samples, where it is the whole recording.
+
+        **Raises:** `ValueError` where parameters are to be followed in it.
+        """
+        if self.whole and self.track is not None:
+            raise ValueError("window.length = 'all' leaves no stretches that [track] could judge: give seconds")
         return self.with_window(samples / self.sample_rate, samples / self.sample_rate) if self.whole else self
 
     @property
@@ -136,7 +161,7 @@ class Pipeline:
     @property
     def step_samples(self) -> int:
         """Samples from one window to the next before decimation."""
-        return round(self.window.step_seconds * self.sample_rate)
+        return round(self.step_seconds * self.sample_rate)
 
     @property
     def window_rows(self) -> int:
@@ -146,7 +171,12 @@ class Pipeline:
     @property
     def step_rows(self) -> int:
         """Rows from one window to the next after decimation."""
-        return max(1, round(self.window.step_seconds * self.sample_rate / self.filters.decimate))
+        return max(1, round(self.step_seconds * self.sample_rate / self.filters.decimate))
+
+    @property
+    def step_seconds(self) -> float:
+        """From one window to the next, which is that from one point of a path to the next where there is one [s]."""
+        return self.window.step_seconds if self.track is None else self.track.grid
 
     def with_window(self, length: float, step: float | None = None) -> Pipeline:
         """With windows of another length, and by default the same step [s]."""
@@ -183,8 +213,26 @@ class Pipeline:
         if self.drive is not None and self.drive not in DRIVES:
             raise ValueError(f"model.drive is '{self.drive}': {nearest(self.drive, DRIVES)}")
         design_filters(self.filter, self.sample_rate)
+        if self.track is not None:
+            self._check_track(self.track)
         if isinstance(self.model, PlanarArm) and self.model.equilibrium is not None:
             _check_elbow(recording)
+
+    def _check_track(self, track: TrackSettings) -> None:
+        """**Raises:** `ValueError` for what parameters cannot be followed through."""
+        if not self.whitens:
+            raise ValueError(
+                "[track] follows parameters through white rows: leave out window.noise and filter.mode, or [track]"
+            )
+        if self.ordinary or self.model.memory:
+            what = "a reflex" if self.model.memory else "this kind of estimates, or a robot from a URDF,"
+            raise ValueError(f"{what} is identified in windows: leave out [track]")
+        if self.drive == FREELY:
+            raise ValueError("a free joint (model.drive) is identified in windows: leave out [track]")
+        for name in track.stays:
+            if name not in self.model.names:
+                hint = nearest(name, list(self.model.names))
+                raise ValueError(f"track.stays has an unknown parameter '{name}': {hint}")
 
     def check_memory(self, recording: Recording) -> None:
         """A model with memory must see the past, and know how many samples it is."""

@@ -52,6 +52,8 @@ class Separation(eqx.Module):
 
     fit: SlidingFit
     """Estimates; the standard errors include the uncertainty of the robot's parameters."""
+    own: AnyArray
+    """(M, h) standard errors without that."""
     white: White | None = eqx.field(static=True)
     """The rows that estimates come from, of the recording with the human last; None where they are those given."""
     torque: Float[Array, " N"]
@@ -67,6 +69,8 @@ class Separation(eqx.Module):
     """What is to be known of the method here, or nothing."""
     doubts: Mapping[int, str] = eqx.field(static=True, default_factory=dict)
     """The human's parameters that the method cannot tell here, and why."""
+    shared: AnyArray = 0.0
+    """() or (h,) what of the human's columns is the robot's own, and was taken off."""
 
 
 Whiten = Callable[..., White]
@@ -181,9 +185,9 @@ def _robot_first(robot: WindowFit, loaded: Regression, slide: _Slide) -> Separat
     torque, n_human = loaded.torque - loaded.robot @ robot.theta, loaded.human.shape[1]
     fit, white = slide(loaded.human, torque, loaded.valid, loaded.robot)
     passed_on = _imitated(slide, white, loaded.human, loaded.robot, loaded.valid)
-    inherited = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on)
+    inherited, own = jnp.einsum("rmh,rs,smh->mh", passed_on, robot.covariance, passed_on), fit.stderr
     fit = _with_inherited_variance(fit, inherited, robot.dof)
-    return Separation(fit, white, torque, loaded.valid, tuple(range(n_human)), passed_on)
+    return Separation(fit, own, white, torque, loaded.valid, tuple(range(n_human)), passed_on)
 
 
 def _imitated(slide: _Slide, white: White | None, W: Array, columns: Array, valid: Array) -> Array:
@@ -233,7 +237,10 @@ def _difference_of_parameters(
     inherited = jnp.broadcast_to(shared @ robot_variance, human.theta.shape)
     passed_on = jnp.broadcast_to(jnp.asarray(shared.T[:, None, :], float), (n_robot, *human.theta.shape))
     fit, torque = _with_inherited_variance(human, inherited, robot.dof), loaded.torque - loaded.robot @ robot.theta
-    return Separation(fit, white, torque, loaded.valid, tuple(human_place.tolist()), passed_on)
+    return Separation(
+        fit, human.stderr, white, torque, loaded.valid, tuple(human_place.tolist()), passed_on,
+        shared=shared @ robot.theta,
+    )  # fmt: skip
 
 
 def _same_motion(
@@ -244,11 +251,11 @@ def _same_motion(
     torque, valid = loaded.torque - alone.torque - moved @ robot.theta, alone.valid & loaded.valid
     fit, white = slide(human, torque, valid)
     imitated = _imitated(slide, white, human, moved, valid)
-    inherited = jnp.einsum("rmh,rs,smh->mh", imitated, robot.covariance, imitated)
+    inherited, own = jnp.einsum("rmh,rs,smh->mh", imitated, robot.covariance, imitated), fit.stderr
     fit = _with_inherited_variance(fit, inherited, robot.dof)
     warning, doubts = _motions_differ(robot, alone, loaded, fit, jnp.einsum("rmh,r->mh", imitated, robot.theta))
     passed_on = _imitated(slide, white, human, loaded.robot, valid) if follow else None
-    return Separation(fit, white, torque, valid, tuple(range(human.shape[1])), passed_on, warning, doubts)
+    return Separation(fit, own, white, torque, valid, tuple(range(human.shape[1])), passed_on, warning, doubts)
 
 
 def _augmented(
@@ -269,7 +276,7 @@ def _augmented(
     )
     passed_on = _imitated(slide, white, W, loaded.robot, valid)[..., n_robot:] if follow else None
     torque = loaded.torque - loaded.robot @ robot.theta
-    return Separation(human, white, torque, valid, tuple(range(n_robot, W.shape[-1])), passed_on)
+    return Separation(human, human.stderr, white, torque, valid, tuple(range(n_robot, W.shape[-1])), passed_on)
 
 
 def _with_inherited_variance(fit: SlidingFit, inherited: Array, robot_dof: Array | float) -> SlidingFit:

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from jaximp.design.files import read_trajectory
 from jaximp.identification.filter_settings import FilterSettings, design_filters
-from jaximp.identification.pipeline import DRIVES, Pipeline, WindowSettings, gap_between
+from jaximp.identification.pipeline import DRIVES, STRETCH, Pipeline, TrackSettings, WindowSettings, gap_between
 from jaximp.identification.separation import METHODS
 from jaximp.jobs.arm import ArmSettings, arm_of_joints, arm_of_trials
 from jaximp.jobs.chain import ChainSettings, TipSettings
@@ -145,6 +145,8 @@ class WindowJob:
     window: WindowSettings
     filter: FilterSettings = field(default_factory=FilterSettings)
     trust: TrustLimits = field(default_factory=TrustLimits)
+    track: TrackSettings | None = None
+    """Parameters that are followed as they move, in place of windows."""
     more_recordings: tuple[Mapping[str, Any], ...] = ()
     """The second and later of several `[[recording]]` tables, which count as one recording with the first."""
     held_out: Mapping[str, Any] | float | None = None
@@ -166,6 +168,11 @@ class WindowJob:
     """Where relative file names start."""
     text: str = ""
     """The job file as written."""
+
+    @property
+    def step_seconds(self) -> float:
+        """From one window, or point of a path, to the next [s]."""
+        return self.window.step_seconds if self.track is None else self.track.grid
 
     def load(self) -> Recording:
         """The recording to be identified.
@@ -258,6 +265,7 @@ class WindowJob:
             robot_drift=self.model.robot_drift,
             reference=self.load_design() or self.reference_period,
             drive=self.model.drive,
+            track=self.track,
         )
 
     def _limits(self, joints: int) -> TrustLimits:
@@ -325,7 +333,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     """A job from TOML text; relative file names start at `folder`."""
     tables = tomllib.loads(text)
     recordings = ["recording", "robot_recording", "robot_recording_after"]
-    known = [*recordings, "held_out", "model", "window", "filter", "trust", "reference_period", "design"]
+    known = [*recordings, "held_out", "model", "window", "track", "filter", "trust", "reference_period", "design"]
     check_keys(tables, [*known, "payload", "posterior", "trials"], "the job")
     if "trials" in tables:
         return _job_of_trials(tables, folder, text)
@@ -339,8 +347,9 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
         if not isinstance(table, dict):
             raise ValueError(f"[{name}] must be a table")
     model = model_settings(tables["model"])
-    if "window" not in tables and model.chain is None:
-        raise ValueError("the job has no [window] table: add one")
+    track = settings(TrackSettings, tables["track"], "track") if "track" in tables else None
+    if "window" not in tables and model.chain is None and track is None:
+        raise ValueError("the job has no [window] table: add one, or [track]")
     job = WindowJob(
         recording=several[0],
         more_recordings=tuple(several[1:]),
@@ -349,7 +358,8 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
         robot_recording_after=_of_robot(tables.get("robot_recording_after"), several[0]),
         payload=payload_settings(tables["payload"]) if "payload" in tables else None,
         model=model,
-        window=_window(tables.get("window", {}), model),
+        window=_window(tables.get("window", {}), model, track),
+        track=track,
         filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
         trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
         reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
@@ -362,8 +372,12 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     return job
 
 
-def _window(table: Any, model: ModelSettings) -> WindowSettings:
-    """`[window]`, whose length may be `"all"`."""
+def _window(table: Any, model: ModelSettings, track: TrackSettings | None) -> WindowSettings:
+    """`[window]`, whose length may be `"all"`, and stands for the stretches beside `[track]`."""
+    if track is not None and isinstance(table, dict):
+        if "step" in table:
+            raise ValueError("window.step has no meaning beside [track]: set track.grid")
+        table = {"length": STRETCH, **table}
     given = table.get("length") if isinstance(table, dict) else None
     if given == math.inf:
         raise ValueError("window.length is inf: it must be a number above zero, or 'all'")
@@ -519,6 +533,7 @@ def _check_values(job: WindowJob) -> None:
     positive = {
         "window.length": job.window.length,
         "window.step": job.window.step,
+        "track.grid": None if job.track is None else job.track.grid,
         "filter.decimate": job.filter.decimate,
         "filter.position_cutoff": job.filter.position_cutoff,
         "filter.decimation_cutoff": job.filter.decimation_cutoff,

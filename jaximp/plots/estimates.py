@@ -70,9 +70,13 @@ def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
     for panel in panels.flat[n:]:
         panel.set_visible(False)
     for panel in panels[-1]:
-        panel.set_xlabel("middle of the window (s)")
+        panel.set_xlabel(_time_label(estimates))
     _legend(figure, panels.flat[0], [estimates])
     return figure
+
+
+def _time_label(estimates: Estimates) -> str:
+    return "time (s)" if estimates.tracks else "middle of the window (s)"
 
 
 @styled
@@ -84,7 +88,9 @@ def condition_over_time(estimates: Estimates) -> Figure:
     draw_line(condition, middle, estimates.fit.cond, color=BLUE)
     condition.set(ylabel="condition number (1)")
     decades(condition, estimates.fit.cond, estimates.threshold)
-    if estimates.threshold is None:
+    if estimates.tracks:
+        remark(condition, f"of stretches of {estimates.window:g} s around each point")
+    elif estimates.threshold is None:
         remark(condition, "no threshold: it needs a reference position and its period")
     else:
         condition.axhline(estimates.threshold, color=VERMILLION, linestyle=":")
@@ -92,12 +98,15 @@ def condition_over_time(estimates: Estimates) -> Figure:
     draw_line(smallest, middle, estimates.fit.sigma_min, color=BLUE)
     smallest.set(ylabel="smallest singular\nvalue (mixed units)")
     decades(smallest, estimates.fit.sigma_min)
-    draw_line(vaf, middle, estimates.fit.vaf, color=BLUE, label="VAF in the window")
+    inside, outside = (
+        ("around it", "by what was known before") if estimates.tracks else ("in the window", "in the next window")
+    )
+    draw_line(vaf, middle, estimates.fit.vaf, color=BLUE, label=f"VAF {inside}")
     ahead = estimates.held_out_vaf
-    draw_line(vaf, middle, ahead, color=VERMILLION, linestyle="--", label="VAF in the next window")
+    draw_line(vaf, middle, ahead, color=VERMILLION, linestyle="--", label=f"VAF {outside}")
     lowest = np.percentile(np.append(ahead[np.isfinite(ahead)], 0.0), 2)
     vaf.set(ylabel="variance accounted\nfor (1)", ylim=(np.clip(lowest, -1, 0) - 0.03, 1.03))
-    vaf.set_xlabel("middle of the window (s)")
+    vaf.set_xlabel(_time_label(estimates))
     for panel in (condition, smallest, vaf):
         _shade(panel, estimates)
     figure.align_ylabels()
@@ -272,7 +281,7 @@ def methods(several: Sequence[Estimates], parameter: str | None = None) -> Figur
         text, color = _mean_over_trusted(estimates, k)
         remark(panel, text, color)
     figure.supylabel(with_unit(several[0].names[k], several[0].units[k]), fontsize=STYLE["axes.labelsize"])
-    panels[-1].set_xlabel("middle of the window (s)")
+    panels[-1].set_xlabel(_time_label(several[0]))
     _legend(figure, panels[int(np.argmax([x.verdicts.trusted.sum() for x in several]))], several)
     return figure
 
@@ -287,16 +296,27 @@ def _parameter_panel(
     _shade(panel, estimates)
     if trusted.any():
         draw_line(panel, middle, np.where(trusted, theta, np.nan), zorder=2.2, color=BLUE, label="trusted")
-        draw_band(panel, middle, low, high, color=BLUE, alpha=0.3, linewidth=0, label=f"{level:.0%} interval")
+        band = f"{level:.0%} band" if estimates.tracks else f"{level:.0%} interval"
+        draw_band(panel, middle, low, high, color=BLUE, alpha=0.3, linewidth=0, label=band)
+    if estimates.tracks:
+        known = np.clip(_up_to_then(estimates)[:, k], *beyond(limits))
+        draw_line(panel, middle, known, color=VERMILLION, linestyle="--", linewidth=0.8, label="known up to then")
     if not trusted.all():
         draw_line(panel, middle, np.clip(theta, *beyond(limits)), color=PALE, linewidth=0.7, label="not trusted")
     panel.set_ylim(limits)
 
 
+def _up_to_then(estimates: Estimates) -> Numbers:
+    """(M, p) what was known of a path up to each of its points; NaN in the first stretch, in which nothing is."""
+    known = np.concatenate([np.asarray(track.filtered.theta) for track in estimates.tracks], axis=1)
+    known[estimates.start < estimates.start[0] + estimates.window] = np.nan
+    return known
+
+
 def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tuple[str, str]:
     """What to write beside a parameter's panel, and in which colour."""
     if not estimates.trusted_in(estimates.names[k]).any():
-        return "none trusted" if brief else "no window can be trusted", VERMILLION
+        return "none trusted" if brief else f"no {estimates.kind} can be trusted", VERMILLION
     if estimates.names[k] in estimates.changed:
         return estimates.changed[estimates.names[k]].split(f" {estimates.units[k]}")[0], BLUE
     return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
@@ -388,7 +408,8 @@ def _torque_lines(upper: Axes, lower: Axes, estimates: Estimates, joint: int, pa
     draw_line(lower, time, np.clip(measured - seen, *far), color=BLUE, linewidth=1)
     if np.isfinite(unseen).any():
         dashed = {"color": VERMILLION, "linestyle": "--", "linewidth": 0.9}
-        draw_line(upper, time, np.clip(unseen, *far), label="model, held out (window before)", **dashed)
+        before = "model, by what was known before" if estimates.tracks else "model, held out (window before)"
+        draw_line(upper, time, np.clip(unseen, *far), label=before, **dashed)
         draw_line(lower, time, np.clip(measured - unseen, *far), **dashed)
 
 

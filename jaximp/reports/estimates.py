@@ -83,6 +83,9 @@ CAPTIONS = {
     "parameters": "Each estimate is an average over its window and stands at the window's middle; what changes faster "
     "is blurred. The interval holds the truth with probability 95 % if model and noise are as assumed and "
     "nothing changes inside the window. Shaded stretches must not be believed.",
+    "path": "Each parameter at every point of the path, from the whole recording. The band holds the truth with "
+    "probability 95 % if model and noise are as assumed; what is not known of how fast parameters move, and of when "
+    "they jump, is in it. Dashed: what was known up to each point. Shaded stretches must not be believed.",
     "against_urdf": "Each parameter with its interval of 95 %, beside the value of the URDF, which knows no friction "
     "and no rotors. Of several windows their mean.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
@@ -108,6 +111,7 @@ CAPTIONS = {
 
 TITLES = {
     "parameters": "Parameters over time",
+    "path": "Parameters over time",
     "against_urdf": "Parameters against the URDF",
     "torque": "Torque",
     "held_out": "Torque of the recording that was held out",
@@ -189,7 +193,8 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
     if isinstance(main.model, Chain):
         figures["against_urdf"] = plots.parameters_against_urdf(main)
     if not _is_one_window(main):
-        figures["parameters"] = plots.parameters_over_time(main.summarised())
+        name = "path" if main.tracks else "parameters"
+        figures[name] = plots.parameters_over_time(main.summarised())
         figures["condition"] = plots.condition_over_time(main)
     if main.held_out is not None:
         figures["held_out"] = plots.torque(main.on_held_out(), "model, from the other recordings")
@@ -212,7 +217,7 @@ def page(
     load: Weighed | DriveGains | None = None,
 ) -> Page:
     """The report on a `summary`, which begins with the load where there is one."""
-    images, recording, windows = pictures(estimates_list, lengths), content["recording"], content["windows"]
+    images, recording = pictures(estimates_list, lengths), content["recording"]
     heading = "" if load is None else "The robot with its load"
     main = main_parameter(estimates_list[0].names)
     below: dict[str, list[Part]] = {
@@ -226,11 +231,12 @@ def page(
     return Page(
         title=recording["name"],
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
-        f"{windows['count']} window{'s' * (windows['count'] != 1)} of {digits(content['window_s'])} s{method}",
+        f"{_estimates_in_words(content)}{method}",
         sections=[
             *load_sections(load),
             Section(heading, [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
             _verdicts(estimates_list[0], content),
+            *_moving(content),
             *_tests(content),
             *_residuals(content),
             *figure_sections(images, TITLES, CAPTIONS, below),
@@ -242,13 +248,21 @@ def page(
     )
 
 
+def _estimates_in_words(content: dict[str, Any]) -> str:
+    """How many windows of which length, or points how far apart."""
+    count = content["windows"]["count"]
+    if content["kind"] == "point":
+        return f"{count} points, {digits(content['step_s'], 2)} s apart"
+    return f"{count} window{'s' * (count != 1)} of {digits(content['window_s'])} s"
+
+
 def _warning(estimates: Estimates, content: dict[str, Any]) -> list[Alert]:
     """What is said before any number where few windows are trusted."""
     windows = content["windows"]
-    count, trusted = windows["count"], windows["trusted"]
+    count, trusted, kind = windows["count"], windows["trusted"], content["kind"]
     if not trusted:
         lines = [
-            f"{of['count']} of {count} windows: {verdict}, such as: {_example(estimates, verdict)}."
+            f"{of['count']} of {count} {kind}s: {verdict}, such as: {_example(estimates, verdict)}."
             for verdict, of in windows["verdicts"].items()
             if of["count"]
         ]
@@ -256,12 +270,12 @@ def _warning(estimates: Estimates, content: dict[str, Any]) -> list[Alert]:
         heading = (
             f"Only {listed(answered)} can be trusted."
             if answered
-            else "No window can be trusted: there is no answer to report."
+            else f"No {kind} can be trusted: there is no answer to report."
         )
         return [Alert("refusal", heading, lines)]
     if windows["trusted_share"] < 0.5:
         share = percent(windows["trusted_share"])
-        heading = f"Only {trusted} of {count} windows ({share}) can be trusted."
+        heading = f"Only {trusted} of {count} {kind}s ({share}) can be trusted."
         return [Alert("caution", heading, ["The numbers below come from these alone."])]
     return []
 
@@ -273,8 +287,9 @@ def _any_answer(content: dict[str, Any]) -> bool:
 
 def _answer(content: dict[str, Any]) -> list[Part]:
     """The parameters, of a geared joint on both sides of the gear."""
+    kind = content["kind"]
     remark = Prose(
-        "Where the spread between windows exceeds the interval of one window, the parameter changes over time and its "
+        f"Where the spread between {kind}s exceeds the interval of one {kind}, the parameter changes over time and its "
         "mean stands for no single moment: see below how it does.",
         remark=True,
     )
@@ -300,9 +315,10 @@ def _parameter_table(found: dict[str, Any]) -> Table:
     medians |= {f"{words(name)} mean delay (median)": value["delay"] for name, value in found["reflex"].items()}
     for name, value in medians.items():
         rows.append([name, digits(value["median"]), "", digits(value["sd"], 2), pretty_unit(value["unit"])])
+    kind = found["kind"]
     heads = (
-        ("Mean over trusted windows", "answer"),
-        ("95 % interval of one window", "number"),
+        (f"Mean over trusted {kind}s", "answer"),
+        (f"95 % interval of one {kind}", "number"),
         ("Spread (sd)", "number"),
     )
     return Table([Column("Parameter", "text"), *(Column(*head) for head in heads), Column("Unit", "text")], rows)
@@ -371,27 +387,32 @@ def _verdicts(estimates: Estimates, content: dict[str, Any]) -> Section:
         for verdict, of in windows["verdicts"].items()
         if of["count"]
     ]
-    columns = [Column("Verdict", "text"), Column("Windows"), Column("Share")]
+    kind = content["kind"]
+    columns = [Column("Verdict", "text"), Column(capitalised(f"{kind}s")), Column("Share")]
     columns += [Column("For example", "text"), Column("What to do", "text")]
     parts: list[Part] = [Table(columns, rows), Prose(_explained(content))]
     notes = _notes(content)
     if notes:
         parts.append(Alert("notes", items=notes))
-    return Section(f"{windows['trusted']} of {windows['count']} windows can be trusted", parts)
+    return Section(f"{windows['trusted']} of {windows['count']} {kind}s can be trusted", parts)
 
 
 def _explained(content: dict[str, Any]) -> str:
+    kind = content["kind"]
     if not content["windows"]["trusted"]:
         share = percent(content["mean_vaf_of_all_windows"])
-        return f"Over all windows the model explains {share} of the torque's variance."
+        return f"Over all {kind}s the model explains {share} of the torque's variance."
     vaf, held_out = content["mean_vaf"], content["mean_held_out_vaf"]
     text = f"In trusted windows the model explains {percent(vaf)} of the torque's variance"
+    if kind == "point":
+        text = f"Around trusted points the path explains {percent(vaf)} of the torque's variance"
     if held_out is not None:
-        text += f", and {percent(held_out)} in the window that follows, which it has not seen"
+        where = "by what was known before" if kind == "point" else "in the window that follows, which it has not seen"
+        text += f", and {percent(held_out)} {where}"
         if vaf - held_out > 0.1:
             text += ". That is much less: the parameters change from window to window, or follow the noise"
     unpredictive = content["windows"]["unpredictive"]
-    if unpredictive:
+    if unpredictive and kind == "window":
         text += f". Of these windows {unpredictive} predict the torque of the next one worse than a constant would"
     return f"{text}."
 
@@ -433,6 +454,26 @@ def _robot_alone(content: dict[str, Any]) -> list[Section]:
         "recording of the robot alone or by robot_drift; the human's standard errors hold it."
     )
     return [Section("Robot alone", [Table(columns, rows, remark=told)])]
+
+
+def _moving(content: dict[str, Any]) -> list[Section]:
+    """How parameters move, where they were followed."""
+    if content["path"] is None:
+        return []
+    rows = []
+    for name, one in content["path"].items():
+        jumps = [f"{digits(jump['time_s'])} s ({percent(jump['probability'])})" for jump in one["jumps"]]
+        more = [f"and {len(jumps) - MOST_SAID} more"] if len(jumps) > MOST_SAID else []
+        ends = digits(one["lowest"]), digits(one["highest"])
+        told = listed([*jumps[:MOST_SAID], *more]) if jumps else ""
+        rows.append([words(name), percent(one["moves"]), *ends, pretty_unit(one["unit"]), told])
+    columns = [Column("Parameter", "text"), Column("Moves, probability"), Column("Lowest"), Column("Highest")]
+    columns += [Column("Unit", "text"), Column("Jumps at (probability)", "text")]
+    remark = (
+        "Over trusted points. How fast each parameter drifts, whether it does, and where it jumps, comes from the "
+        "likelihood of the recording; before anything is measured, staying is as probable as drifting."
+    )
+    return [Section("How parameters move", [Table(columns, rows, remark=remark)])]
 
 
 def _tests(content: dict[str, Any]) -> list[Section]:
@@ -569,6 +610,8 @@ def _result(estimates: Estimates) -> dict[str, Any]:
     parts = estimates.human_joints
     step = np.diff(estimates.start)
     return {
+        "kind": estimates.kind,
+        "path": _path(estimates),
         "method": estimates.method,
         "method_description": None if estimates.method is None else METHODS[estimates.method],
         "window_s": estimates.window,
@@ -618,7 +661,27 @@ def _at_joint(estimates: Estimates, parts: list[HumanPart]) -> dict[str, Any] | 
         factor[part.columns] = part.factor
     equilibrium = _equilibria(parts, estimates.verdicts.trusted, geared=True)
     reflex = {reflex.name: _reflex(reflex, estimates, factor) for reflex in estimates.reflexes}
-    return {"parameters": _parameters(estimates, factor), "equilibrium": equilibrium, "reflex": reflex}
+    parameters = _parameters(estimates, factor)
+    return {"kind": estimates.kind, "parameters": parameters, "equilibrium": equilibrium, "reflex": reflex}
+
+
+def _path(estimates: Estimates) -> dict[str, Any] | None:
+    """How parameters move, where they were followed."""
+    if not estimates.tracks:
+        return None
+    found, k = {}, 0
+    for track in estimates.tracks:
+        for name in track.names:
+            value = estimates.value[estimates.trusted_in(estimates.names[k]), k]
+            found[estimates.names[k]] = {
+                "unit": estimates.units[k],
+                "moves": track.moves(name),
+                "lowest": float(value.min()) if len(value) else math.nan,
+                "highest": float(value.max()) if len(value) else math.nan,
+                "jumps": [{"time_s": jump.time, "probability": jump.probability} for jump in track.jumps(name)],
+            }
+            k += 1
+    return found
 
 
 def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
@@ -737,7 +800,7 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
 
     vaf, tested = limits["min_vaf"], content["tests"]
     needed = "a model that lacks nothing" if tested and vaf is None else f"a VAF of {0.75 if vaf is None else vaf:g}"
-    threshold, step = content["threshold"], content["step_s"]
+    threshold = content["threshold"]
     speed = "m/s" if set(recording["joints"]) == {"prismatic"} else "rad/s"
     return {
         "recording": f"{recording['samples']} samples, {percent(recording['valid_share'])} of them valid",
@@ -749,13 +812,22 @@ def _settings(content: dict[str, Any]) -> dict[str, str]:
         "samples kept after the filters": "all" if filters["decimate"] == 1 else f"one of {filters['decimate']}",
         "filters run": "once, over the whole recording" if filters["mode"] == "once" else "inside every window",
         "derivatives": "measured" if filters["measured_derivatives"] else DERIVATIVES[filters["derivatives"]],
-        "window": f"{content['window_s']:g} s" + ("" if step is None else f", one every {step:.3g} s"),
+        **_windows_in_words(content),
         "slowest motion that counts": f"{content['min_velocity']:g} {speed}" if content["min_velocity"] else "any",
         "threshold on the condition number": "none" if threshold is None else f"{threshold:.4g}",
-        "to be trusted, a window needs": f"{needed}, standard errors below "
+        f"to be trusted, a {content['kind']} needs": f"{needed}, standard errors below "
         f"{percent(limits['max_relative_stderr'])}, columns {limits['min_excitation_ratio']:g} times above position "
         f"noise, {percent(limits['min_valid_share'])} of its samples",
     }
+
+
+def _windows_in_words(content: dict[str, Any]) -> dict[str, str]:
+    """Windows, or points and the stretches around them."""
+    step = content["step_s"]
+    if content["kind"] == "point":
+        stretch = f"motion and noise judged in stretches of {content['window_s']:g} s"
+        return {"path": f"a point every {step:.3g} s, {stretch}"}
+    return {"window": f"{content['window_s']:g} s" + ("" if step is None else f", one every {step:.3g} s")}
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from statistics import NormalDist
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -69,6 +70,21 @@ class Drift(eqx.Module):
         return np.asarray(np.asarray(self.weight) @ (np.asarray(self.size) > 0))
 
 
+LIKELY = 0.5
+"""A jump that is more probable than this is told."""
+AROUND = 10
+"""Points on both sides of a jump that its probability may be spread over."""
+
+
+class Jump(NamedTuple):
+    """Where a parameter jumps."""
+
+    name: str
+    time: float
+    """As `Track.time`."""
+    probability: float
+
+
 class Track(eqx.Module, Result):
     """Parameters along a record, with what is known of how they move."""
 
@@ -116,6 +132,27 @@ class Track(eqx.Module, Result):
     def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
         """(G, p): lower and upper ends of the bands that hold the truth with probability `level` at each point."""
         return self.path.interval(level)
+
+    def jumps(self, name: str, least: float = LIKELY) -> list[Jump]:
+        """Where one parameter jumps, in the order of time, with a probability of at least so much each."""
+        found: list[Jump] = []
+        time = np.asarray(self.time)
+        between = (time + np.append(time[:1], time[:-1])) / 2  # a jump is in front of its point
+        left = np.array(self.jumped)[:, self.names.index(name)]
+        while True:
+            sums = np.convolve(left, np.ones(2 * AROUND + 1), "same")
+            middle = int(sums.argmax())
+            if not sums[middle] >= least:
+                return sorted(found, key=lambda one: one.time)
+            near = slice(max(0, middle - AROUND), middle + AROUND + 1)
+            at = float((left[near] * between[near]).sum() / left[near].sum())
+            found.append(Jump(name, at, min(1.0, float(sums[middle]))))
+            left[near] = 0
+
+    def moves(self, name: str) -> float:
+        """The probability that a parameter moves at all, by drifting or in jumps."""
+        drifts = float(self.drift.moves[self.names.index(name)])
+        return max([drifts, *(one.probability for one in self.jumps(name, least=0.01))])
 
     def columns(self) -> list[Column]:
         """A row for each point of the grid."""

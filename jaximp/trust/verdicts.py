@@ -100,13 +100,15 @@ class Verdicts:
         """How many estimates got each verdict."""
         return {verdict: int((self.verdict == verdict).sum()) for verdict in VERDICTS}
 
-    def complaint(self) -> str:
-        """Where nothing can be trusted, what is said of the first that has the most frequent verdict; else empty."""
+    def complaint(self, kind: str = "window") -> str:
+        """Where nothing can be trusted, what is said of the first that has the most frequent verdict; else empty.
+
+        **Arguments:** `kind`, what is judged."""
         if self.trusted.any() or not len(self.verdict):
             return ""
         counts = self.counts()
         first = int(np.argmax(self.verdict == max(counts, key=lambda name: counts[name])))
-        return f"no window can be trusted, for example: {self.reason[first]}"
+        return f"no {kind} can be trusted, for example: {self.reason[first]}"
 
 
 def judge_all(rules: Sequence[Rule[Any]], evidence: Judged, limits: TrustLimits) -> Verdicts:

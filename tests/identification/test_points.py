@@ -1,0 +1,127 @@
+"""A stiffness that moves, followed through the whole pipeline in place of windows."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factories.joints import sines
+from jaximp.identification.estimates import Estimates
+from jaximp.jobs.job import WindowJob, parse_job
+from jaximp.jobs.run import identify_recording
+from jaximp.recordings.load import recording_from_arrays
+from jaximp.reports import estimates as report
+from jaximp.trust.verdicts import TRUSTED, WEAK
+from jaximp.types import Recording
+
+RATE, SECONDS, CHANGE = 200.0, 16.0, 7.3
+REST, FADE = (10.0, 14.0), 0.8  # s
+INERTIA, DAMPING, BEFORE, AFTER = 0.02, 1.0, 60.0, 110.0
+JOB = """
+[recording]
+file = "in the test"
+[model]
+human = { offset = false }
+[filter]
+position_cutoff = 40
+decimation_cutoff = 30
+"""
+
+
+def stiffness(time: np.ndarray) -> np.ndarray:
+    return np.where(time < CHANGE, BEFORE, AFTER)
+
+
+def recorded(seed: int = 0) -> Recording:
+    """Lines of five frequencies, at rest for a while: they come and go by a raised sine."""
+    time, random = np.arange(round(SECONDS * RATE)) / RATE, np.random.default_rng(seed)
+    s, ds, dds = sines(time, tuple((0.02 / f**0.5, f, random.uniform(0, 2 * np.pi)) for f in (0.9, 1.7, 3.1, 5.3, 8.3)))
+    still = np.clip(np.minimum(time - REST[0], REST[1] - time) / FADE + 1, 0, 1) * np.pi
+    fading = np.where((still > 0) & (still < np.pi), 1.0, 0.0)
+    sign = np.where(time < np.mean(REST), 1, -1) * np.pi / FADE
+    m, dm, ddm = (1 + np.cos(still)) / 2, -fading * sign * np.sin(still) / 2, -fading * sign**2 * np.cos(still) / 2
+    q, dq, ddq = m * s, m * ds + dm * s, m * dds + 2 * dm * ds + ddm * s
+    torque = INERTIA * ddq + DAMPING * dq + stiffness(time) * q + random.normal(0, 0.02, len(time))
+    return recording_from_arrays(time, q, torque)
+
+
+def job(tables: str, text: str = JOB) -> WindowJob:
+    found = parse_job(text + tables)
+    assert isinstance(found, WindowJob)
+    return found
+
+
+@cache
+def followed() -> Estimates:
+    return identify_recording(job('[track]\ngrid = 0.1\nstays = ["inertia"]\n'), recorded())[0]
+
+
+def middle() -> np.ndarray:
+    return (followed().start + followed().end) / 2
+
+
+def test_a_path_follows_a_step_that_windows_blur() -> None:
+    time = middle()
+    near = (np.abs(time - CHANGE) < 1.0) & (np.abs(time - CHANGE) > 0.15)
+    path, truth = followed()["stiffness"], stiffness(time)
+    low, high = path.interval()
+    assert ((low <= truth) & (truth <= high))[near].mean() > 0.9
+    assert np.abs(path.value - truth)[near].max() < 0.1 * (AFTER - BEFORE)
+    assert (followed().verdicts.verdict[near] == TRUSTED).all()
+
+    windows = identify_recording(job("[window]\nlength = 2.0\nstep = 0.1\n"), recorded())[0]
+    around = (windows.start < CHANGE - 0.3) & (windows.end > CHANGE + 0.3)
+    blurred = np.abs(windows["stiffness"].value - stiffness((windows.start + windows.end) / 2))
+    assert blurred[around].max() > 0.2 * (AFTER - BEFORE)
+
+
+def test_what_moves_is_told_and_when_it_jumps() -> None:
+    assert set(followed().changed) == {"stiffness"}
+    assert followed().changed["stiffness"].startswith(("60", "59"))
+    (track,) = followed().tracks
+    (jump,) = track.jumps("stiffness")
+    assert abs(jump.time - CHANGE) < 0.15
+    assert jump.probability > 0.9
+    assert track.moves("inertia") == 0
+
+
+def test_a_parameter_that_stays_is_one_value() -> None:
+    assert np.ptp(followed()["inertia"].value) < 1e-9
+    low, high = followed()["inertia"].interval()
+    assert low[0] < INERTIA < high[0]
+
+
+def test_at_rest_points_are_not_trusted() -> None:
+    resting = (middle() > REST[0] + 1.2) & (middle() < REST[1] - 1.2)  # the stretch around them is, too
+    assert (followed().verdicts.verdict[resting] == WEAK).all()
+    assert followed().trusted[middle() < 9].mean() > 0.9
+
+
+def test_a_row_of_the_table_is_a_point() -> None:
+    table = report.estimates_table(followed()).to_pandas()
+    np.testing.assert_allclose(np.diff(table["start_s"]), 0.105)  # whole rows that say something new
+    assert len(table) == np.ceil(SECONDS / 0.105)
+    known = table["stiffness_filtered"][table["start_s"] > 3]
+    assert (known - stiffness(table["start_s"][known.index])).abs().median() < 2
+    assert table["stiffness_jump"].sum() > 0.9
+    # What is known of a point is more than what was known when it had just passed.
+    assert (table["stiffness_stderr"] < table["stiffness_filtered_stderr"] * 1.05).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("tables", "text", "message"),
+    [
+        ("[track]\n[window]\nstep = 1.0\n", JOB, "window.step has no meaning beside"),
+        ('[track]\n[window]\nlength = "all"\n', JOB, "give seconds"),
+        ('[track]\nstays = ["mass"]\n', JOB, "track.stays has an unknown parameter 'mass'"),
+        ('[track]\n[window]\nnoise = "filtered"\n', JOB, "leave out window.noise"),
+        ("[track]\ngrid = 0\n", JOB, "track.grid is 0"),
+        ("[track]\n", JOB.replace("offset = false", "reflex = true"), "a reflex is identified in windows"),
+        ("[track]\n", JOB.replace("[model]", '[model]\ndrive = "free"'), "a free joint"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_followed_is_refused(tables: str, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        identify_recording(job(tables, text), recorded())
