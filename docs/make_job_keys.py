@@ -20,7 +20,7 @@ from typing import Any
 
 from jaximp.design.limits import Limits
 from jaximp.identification.filter_settings import FilterSettings
-from jaximp.identification.pipeline import WindowSettings
+from jaximp.identification.pipeline import TrackSettings, WindowSettings
 from jaximp.jobs.arm import OF_HAND, OF_JOINTS, ArmSettings, InertiaSettings
 from jaximp.jobs.chain import ChainSettings, TipSettings
 from jaximp.jobs.design import ClearanceSettings, DesignSettings, EncoderSettings
@@ -93,6 +93,11 @@ RECORDING_JOB = (
     ),
     Table("[filter]", FilterSettings, "Filters of position and torque, all run forward and backward."),
     Table("[window]", WindowSettings),
+    Table(
+        "[track]",
+        TrackSettings,
+        "Parameters that are followed as they move, in place of windows. See [parameters that move](tracking.md).",
+    ),
     Table("[trust]", TrustLimits),
     Table("[posterior]", PosteriorSettings, "Used by `jaximp posterior` alone.", hidden=("prior",)),
     Table(

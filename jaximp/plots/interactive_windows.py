@@ -159,6 +159,8 @@ class Quality:
     vaf: Numbers
     held_out_vaf: Numbers
     threshold: float | None = None
+    unseen: str = "in the next window"
+    """Where, or by what, the torque is predicted that was held out."""
 
 
 def over_time(windows: Windows, torque: Torque, quality: Quality | None = None) -> dict[str, Live]:
@@ -307,8 +309,8 @@ def _condition(time: _Time, quality: Quality) -> Live:
     vaf.line("x", "ahead", source=source, color=VERMILLION, line_dash="dashed", line_width=1.5)
     time.tell(condition, "condition number <b>@condition{%.4g}</b>")
     time.tell(smallest, "smallest singular value <b>@sigma{%.4g}</b>")
-    time.tell(vaf, "VAF <b>@vaf{%.4g}</b>, in the next window <b>@ahead{%.4g}</b>")
-    key = [Key("line", BLUE, "in the window"), Key("dash", VERMILLION, "VAF in the next window, which it has not seen")]
+    time.tell(vaf, f"VAF <b>@vaf{{%.4g}}</b>, {quality.unseen} <b>@ahead{{%.4g}}</b>")
+    key = [Key("line", BLUE, "in the window"), Key("dash", VERMILLION, f"VAF {quality.unseen}, which it has not seen")]
     if quality.threshold is not None:
         line = Span(
             location=quality.threshold, dimension="width", line_color=VERMILLION, line_dash="dotted", line_width=2

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,9 +83,6 @@ CAPTIONS = {
     "parameters": "Each estimate is an average over its window and stands at the window's middle; what changes faster "
     "is blurred. The interval holds the truth with probability 95 % if model and noise are as assumed and "
     "nothing changes inside the window. Shaded stretches must not be believed.",
-    "path": "Each parameter at every point of the path, from the whole recording. The band holds the truth with "
-    "probability 95 % if model and noise are as assumed; what is not known of how fast parameters move, and of when "
-    "they jump, is in it. Dashed: what was known up to each point. Shaded stretches must not be believed.",
     "against_urdf": "Each parameter with its interval of 95 %, beside the value of the URDF, which knows no friction "
     "and no rotors. Of several windows their mean.",
     "torque": "The torque that the model had to explain, the model's torque with the parameters of the window around "
@@ -107,11 +104,19 @@ CAPTIONS = {
     "methods": "The same by several methods of telling the human from the robot, with intervals of 95 %.",
 }
 """Figures in the order of the report, and how to read them."""
-
+OF_PATH = {
+    "parameters": "Each parameter at every point of the path, from the whole recording. The band holds the truth with "
+    "probability 95 % if model and noise are as assumed; what is not known of how fast parameters move, and of when "
+    "they jump, is in it. Dashed: what was known up to each point. Shaded stretches must not be believed.",
+    "torque": "The torque that the model had to explain, the model's torque with the parameters of the path (fitted), "
+    "and with what was known of them before.",
+    "condition": "Of the stretch around each point: a large condition number or a small singular value means that its "
+    "motion does not tell the parameters apart. Bands of the path are wide there.",
+}
+"""What is said of them where parameters were followed."""
 
 TITLES = {
     "parameters": "Parameters over time",
-    "path": "Parameters over time",
     "against_urdf": "Parameters against the URDF",
     "torque": "Torque",
     "held_out": "Torque of the recording that was held out",
@@ -132,15 +137,19 @@ def live_figures(estimates: Estimates) -> dict[str, Live]:
     value = np.asarray(shown.fit.theta)
     low, high = (np.asarray(end) for end in confidence_interval(value, np.asarray(shown.fit.stderr), shown.fit.dof))
     condition, vaf, held_out = np.asarray(fit.cond), np.asarray(fit.vaf), np.asarray(estimates.held_out_vaf)
-    told = zip(condition.tolist(), vaf.tolist(), held_out.tolist(), strict=True)
+    told, path = zip(condition.tolist(), vaf.tolist(), held_out.tolist(), strict=True), bool(estimates.tracks)
+    unseen = "by what was known before" if path else "next window"
     remarks = [
-        f"Condition number {number(cond, 3)}, VAF {number(share, 3)}, next window {number(ahead, 3)}."
+        f"Condition number {number(cond, 3)}, VAF {number(share, 3)}, {unseen} {number(ahead, 3)}."
         for cond, share, ahead in told
     ]
+    start, end = estimates.start, estimates.end
+    if path:  # whoever picks a point sees the stretch around it
+        middle = (start + end) / 2
+        start, end = (middle + side * estimates.window / 2 for side in (-1, 1))
     windows = Windows(
-        shown.names, shown.units, estimates.start, estimates.end, value, low, high, verdicts.verdict, verdicts.reason,
-        remark=remarks,
-    )  # fmt: skip
+        shown.names, shown.units, start, end, value, low, high, verdicts.verdict, verdicts.reason, remark=remarks
+    )
     joints = range(estimates.torque.shape[1])
     efforts = [plots.effort(estimates, joint) for joint in joints]
     names = [
@@ -148,9 +157,10 @@ def live_figures(estimates: Estimates) -> dict[str, Live]:
     ]
     models = {
         "model, fitted": estimates.reconstructed,
-        "model, held out (window before)": estimates.predicted,
+        "model, by what was known before" if path else "model, held out (window before)": estimates.predicted,
     }
     quality = Quality(condition, np.asarray(fit.sigma_min), vaf, held_out, estimates.threshold)
+    quality = replace(quality, unseen=unseen) if path else quality
     live = over_time(windows, Torque(estimates.time, names, estimates.torque, models), quality)
     return {"torque": live["torque"]} if _is_one_window(estimates) and "torque" in live else live
 
@@ -193,8 +203,7 @@ def pictures(estimates_list: Sequence[Estimates], lengths: Sequence[Estimates]) 
     if isinstance(main.model, Chain):
         figures["against_urdf"] = plots.parameters_against_urdf(main)
     if not _is_one_window(main):
-        name = "path" if main.tracks else "parameters"
-        figures[name] = plots.parameters_over_time(main.summarised())
+        figures["parameters"] = plots.parameters_over_time(main.summarised())
         figures["condition"] = plots.condition_over_time(main)
     if main.held_out is not None:
         figures["held_out"] = plots.torque(main.on_held_out(), "model, from the other recordings")
@@ -239,7 +248,7 @@ def page(
             *_moving(content),
             *_tests(content),
             *_residuals(content),
-            *figure_sections(images, TITLES, CAPTIONS, below),
+            *figure_sections(images, TITLES, CAPTIONS | (OF_PATH if content["kind"] == "point" else {}), below),
             *_robot_alone(content),
             *closing_sections("Sampling, filters and limits", _settings(content), content["job"]),
         ],
