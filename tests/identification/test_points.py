@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,3 +126,58 @@ def test_a_row_of_the_table_is_a_point() -> None:
 def test_what_cannot_be_followed_is_refused(tables: str, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         identify_recording(job(tables, text), recorded())
+
+
+def test_the_report_speaks_of_points(tmp_path: Path) -> None:
+    content = report.summary([followed()], job("[track]\n"), recorded())
+    assert content["kind"] == "point"
+    assert content["path"]["stiffness"]["jumps"][0]["time_s"] == pytest.approx(CHANGE, abs=0.15)
+    report.write_results(tmp_path, [followed()], [], job("[track]\n"), recorded())
+    text = (tmp_path / "report.html").read_text()
+    assert "How parameters move" in text
+    assert "points can be trusted" in text
+    assert (tmp_path / "parameters.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.compiles
+def test_joints_side_by_side_have_a_path_each() -> None:
+    one, other = recorded(), recorded(1)
+    both = recording_from_arrays(
+        one.time, np.hstack([one.position, 0.5 * other.position]), np.hstack([one.torque, 0.5 * other.torque])
+    )
+    found = identify_recording(job('[track]\ngrid = 0.1\nstays = ["joint1.inertia", "joint2.inertia"]\n'), both)[0]
+    assert found.names[2] == "joint1.stiffness"
+    assert len(found.tracks) == 2
+    np.testing.assert_allclose(found.value[:, :3], followed().value, rtol=1e-6)
+    assert set(found.changed) == {"joint1.stiffness", "joint2.stiffness"}
+    columns = report.estimates_table(found).column_names
+    assert {"joint1.stiffness_jump", "joint2.damping_filtered"} <= set(columns)
+
+
+@pytest.mark.slow
+@pytest.mark.compiles
+@pytest.mark.parametrize("method", [1, 2, 3, 4])
+def test_a_human_in_a_robot_is_followed_by_every_method(method: int) -> None:
+    held, alone = (with_robot(recorded(seed), human) for seed, human in ((0, True), (0, False)))
+    text = JOB.replace("[model]", f"[model]\nrobot = {{ gravity = false, coulomb = false }}\nmethods = [{method}]")
+    text += '[robot_recording]\nfile = "in the test"\n'
+    found = identify_recording(job('[track]\ngrid = 0.1\nstays = ["inertia"]\n', text), held, alone)[0]
+    assert found.method == method
+    time = (found.start + found.end) / 2
+    far = np.abs(time - CHANGE) > 0.5
+    low, high = found["stiffness"].interval()
+    truth = stiffness(time)
+    assert ((low <= truth) & (truth <= high))[far & found.trusted].mean() > 0.8
+    assert np.median(high - low) < 0.1 * (AFTER - BEFORE)
+    assert (found["inertia"].interval()[0] <= INERTIA).all()
+    assert (found["inertia"].interval()[1] >= INERTIA).all()
+
+
+def with_robot(human: Recording, held: bool) -> Recording:
+    """The robot that holds the joint, or makes the same motion alone."""
+    q = human.position[:, 0]
+    dq = np.gradient(q, human.time)
+    robot = 0.05 * np.gradient(dq, human.time) + 0.7 * dq
+    noise = np.random.default_rng(7).normal(0, 0.02, len(q))
+    return recording_from_arrays(human.time, q, robot + (human.torque[:, 0] if held else noise))
