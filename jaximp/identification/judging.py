@@ -30,7 +30,14 @@ from jaximp.identification.misfit import (
     unnoticed,
 )
 from jaximp.identification.pipeline import FREELY, Pipeline
-from jaximp.identification.points import Followed, moves_in_words, points_of_path, points_of_windows, windows_apart
+from jaximp.identification.points import (
+    SURELY,
+    Followed,
+    moves_in_words,
+    points_of_path,
+    points_of_windows,
+    windows_apart,
+)
 from jaximp.identification.prepared import Prepared, has_instruments
 from jaximp.identification.robot_changes import NO_DOUBTS, Doubts
 from jaximp.identification.rows import Rows
@@ -43,11 +50,13 @@ from jaximp.models.chain import Chain
 from jaximp.models.determined import sizes_of_chain
 from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
+from jaximp.tracking.results import Track
 from jaximp.trust import plausibility
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
 from jaximp.trust.window_rules import (
+    MASSES,
     Windows,
     excited_windows,
     is_chain,
@@ -56,7 +65,7 @@ from jaximp.trust.window_rules import (
     judged_names,
     measure_windows,
 )
-from jaximp.types import Numbers, Recording
+from jaximp.types import Numbers, Recording, listed
 
 CLEAR = 2.0
 """A reflex whose gain is so many standard errors from zero has a delay."""
@@ -129,6 +138,7 @@ def judge(
     )
     if followed is not None:
         changed = moves_in_words(points.tracks[0], judge_windows(measured, limits).trusted)
+        notes = (*notes, _moving_mass(model, points.tracks[0]))
     else:
         side_by_side = apart * np.flatnonzero(excited_windows(measured, limits)[::apart])
         changed = changes(pipeline, sure, side_by_side, start, end)
@@ -211,6 +221,21 @@ def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limi
     theta, stderr = (np.asarray(x)[:, which] * factor for x in (fit.theta, fit.stderr))
     outside = plausibility.times_outside(theta, stderr, ranges, limits.errors_apart)
     return replace(measured, impedance=theta, outside=outside)
+
+
+def _moving_mass(model: Model, track: Track) -> str:
+    """What a mass that moves says of the model; empty where none does."""
+    moving = [
+        name
+        for name, role in zip(model.names, model.roles, strict=True)
+        if role in MASSES and track.moves(name) > SURELY
+    ]
+    if not moving:
+        return ""
+    return (
+        f"{listed(moving)} moves, as no mass does by itself: the model lacks something, or the gain of a sensor "
+        "changes; a limb's is known to stay (track.stays)"
+    )
 
 
 def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str], of_path: bool) -> list[str]:
