@@ -98,7 +98,8 @@ def in_windows(
     if not prepared.solved and prepared.stackable:
         prepared = solve_windows([prepared], longest=longest)[0]
     found = _in_windows(prepared, progress, longest, curves)
-    if prepared.pair is not None or not prepared.pipeline.once:
+    of_path = prepared.pipeline.track is not None and prepared.held_out is None
+    if prepared.pair is not None or not prepared.pipeline.once or of_path:
         return found
     if not curves and not isinstance(prepared.model, Chain):
         return found

@@ -210,7 +210,8 @@ def without_unknown_delay(pipeline: Pipeline, recording: Recording) -> Recording
     if recording.n_joints > 1:
         raise ValueError('torque: delay = "estimate" works on one joint: give the delay in seconds')
     model = pipeline.model if pipeline.robot is None else combine(pipeline.robot, pipeline.model)
-    own = replace(once(pipeline), model=model, robot=None, window=replace(pipeline.window, noise=NOISE[0]))
+    window = replace(pipeline.window, noise=NOISE[0])
+    own = replace(once(pipeline), model=model, robot=None, track=None, window=window)
     as_recorded = replace(recording, delay_unknown=False)
     prepared = prepare(own, as_recorded)
     found = find_delay(own, prepared.rows)

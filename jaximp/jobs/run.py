@@ -103,4 +103,9 @@ def infer_recording(
     """As `infer`, for recordings that are in memory."""
     if job.model.tip is not None:
         raise ValueError("a human at the end of a robot has no posterior: leave out [model.human], or run identify")
+    if job.track is not None:
+        raise ValueError(
+            "posteriors are those of windows, and the bands of [track] hold what is not known already: leave out "
+            "[track], or run identify"
+        )
     return posterior_of(job.pipeline_for(recording), job.posterior, recording, alone, progress)

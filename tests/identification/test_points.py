@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from factories.joints import sines
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import WindowJob, parse_job
-from jaximp.jobs.run import identify_recording
+from jaximp.jobs.run import identify_recording, infer_recording
 from jaximp.recordings.load import recording_from_arrays
 from jaximp.reports import estimates as report
 from jaximp.trust.verdicts import TRUSTED, WEAK
@@ -126,6 +127,18 @@ def test_a_row_of_the_table_is_a_point() -> None:
 def test_what_cannot_be_followed_is_refused(tables: str, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         identify_recording(job(tables, text), recorded())
+
+
+def test_a_delay_is_found_before_the_path() -> None:
+    whole = recorded()
+    late = replace(whole, torque=np.roll(whole.torque, 3, axis=0), delay_unknown=True)
+    notes = identify_recording(job('[track]\ngrid = 0.1\nstays = ["inertia"]\n'), late)[0].notes
+    assert any("was moved by so much" in note for note in notes)
+
+
+def test_posteriors_are_those_of_windows() -> None:
+    with pytest.raises(ValueError, match="leave out \\[track\\]"):
+        infer_recording(job("[track]\n"), recorded())
 
 
 def test_the_report_speaks_of_points(tmp_path: Path) -> None:
