@@ -31,6 +31,7 @@ from jaximp.recordings.mapping import columns_of, is_number
 from jaximp.recordings.outputs import MARK
 from jaximp.recordings.readers.formats import FORMATS, count_samples
 from jaximp.recordings.readers.text import delimiter_of
+from jaximp.types import listed
 
 MOST_SIZES = 3
 """Padded lengths of a plan: each is compiled once, and a study should need no more than six programs."""
@@ -344,12 +345,20 @@ def why_alone(job: WindowJob) -> str:
 def of_recordings(job: Job) -> WindowJob:
     """The job, if it is one for many recordings.
 
-    **Raises:** `ValueError` for a job with trials, and for one with a payload.
+    **Raises:** `ValueError` for a job with trials, with a payload, or that leaves filters or windows to what suits its
+    recording.
     """
     if isinstance(job, TrialsJob):
         raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
     if job.payload is not None:
         raise ValueError("a job with [payload] is about one pair of recordings: run `jaximp identify` on it")
+    if job.left_out:
+        tables = listed([f"[{name}]" for name in job.left_out])
+        none = " (an empty [filter] is none)" if "filter" in job.left_out else ""
+        raise ValueError(
+            f"the job leaves out {tables}, and a batch treats all recordings alike: `jaximp check` proposes what to "
+            f"write{none}"
+        )
     return job
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from jaximp.cli.terminal import Force, JobFile, Out, bar_of, say_where
+from jaximp.cli.terminal import Force, JobFile, OutBeside, bar_of, out_beside, say_where
 
 if TYPE_CHECKING:
     from jaximp.identification.estimates import Estimates
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from jaximp.perturbation.impedance import ArmImpedance
 
 
-def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
-    """Estimate the parameters in every window of a recording, or the impedance of an arm from perturbation trials.
+def identify(job_file: JobFile, out: OutBeside = None, force: Force = False) -> None:
+    """Estimate the parameters in every window of a recording, or along a path that follows them, or the impedance of an
+    arm from perturbation trials.
 
     Writes estimates.parquet (one row per window, or one per method), summary.json, report.html and the figures into
     the folder.
@@ -27,7 +28,7 @@ def identify(job_file: JobFile, out: Out, force: Force = False) -> None:
     from jaximp.jobs.job import read_job
     from jaximp.recordings.outputs import new_folder
 
-    job = read_job(job_file)
+    job, out = read_job(job_file), out_beside(job_file, out, "results")
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
         identify_into(job, folder)
     say_where(out)
@@ -40,13 +41,14 @@ def identify_into(job: Job, folder: Path) -> None:
         _identify_trials_into(job, folder)
         return
     from jaximp.identification.identify import at_other_lengths, in_windows, longest_of
-    from jaximp.jobs.run import load_pair, prepare, weigh
+    from jaximp.jobs.run import CHOSEN, complete, load_pair, prepare, weigh
 
     # Figures take long to import: that is done while the other core compiles.
     Thread(target=import_module, args=("jaximp.reports.estimates",)).start()
     with bar_of("identifying") as progress:
         recording, alone, held_out, pair = job.load(), job.load_robot_alone(), job.load_held_out(), load_pair(job)
         progress(0.1)
+        job, recording = complete(job, recording, alone, lambda share: progress(0.1 + 0.1 * share))
         prepared = prepare(job, recording, alone, held_out)
         progress(0.3)
         estimates = in_windows(prepared, lambda share: progress(0.3 + 0.3 * share), longest_of(prepared))
@@ -58,6 +60,8 @@ def identify_into(job: Job, folder: Path) -> None:
         progress(0.9)
         write_results(folder, estimates, lengths, job, prepared.recording, found)
         progress(1.0)
+    for note in (note for note in recording.notes if note.startswith(CHOSEN)):
+        typer.echo(note)
     _say_result(estimates[0])
     for line in [] if found is None else found.in_words():
         typer.echo(line)

@@ -17,6 +17,10 @@ console = Console(stderr=True, highlight=False)
 
 JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to identify, from which recording.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must not exist yet.")]
+OutBeside = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Folder to write; it must not exist yet.", show_default="beside the job"),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace a folder that jaximp wrote earlier.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the simulated noise.")]
 
@@ -30,6 +34,11 @@ def bar_of(task: str) -> Iterator[Progress]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         name = bar.add_task(task, total=1.0)
         yield lambda share: bar.update(name, completed=share)
+
+
+def out_beside(job_file: Path, out: Path | None, what: str) -> Path:
+    """The folder that was asked for, or one beside the job and called after it."""
+    return job_file.with_name(f"{job_file.stem}-{what}") if out is None else out
 
 
 def say_where(out: Path) -> None:

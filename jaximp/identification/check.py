@@ -79,11 +79,6 @@ def check_recording(
                 findings += [_saturation(label, column), *_range(label, recording.joints[joint], column)]
     progress(0.1)
     bandwidth = coherent_bandwidth(recording)
-    position_cutoff, decimation_cutoff = _cutoffs(bandwidth, recording)
-    filters = replace(
-        pipeline.filter, position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff, decimate=None
-    )
-    pipeline = replace(pipeline, filter=filters)
     findings.append(
         Finding(
             "bandwidth",
@@ -91,15 +86,38 @@ def check_recording(
             f"position and torque belong together (coherence above 0.8, or slow motion) up to {bandwidth:.3g} Hz",
         )
     )
+    found, proposal = propose(pipeline, recording, alone, progress)
+    return [*findings, *found], proposal
+
+
+def propose(
+    pipeline: Pipeline,
+    recording: Recording,
+    alone: RobotAlone = None,
+    progress: Progress = lambda share: None,
+    filters: bool = True,
+    windows: bool = True,
+) -> tuple[list[Finding], Proposal]:
+    """Cut-offs and a window that suit a recording, and what was found with them.
+
+    **Arguments:** whether `filters` are wanted, or those of the pipeline stay; whether `windows` are tried.
+    """
+    cutoffs = _cutoffs(coherent_bandwidth(recording), recording)
+    given = pipeline.filter
+    if filters:
+        given = replace(given, position_cutoff=cutoffs[0], decimation_cutoff=cutoffs[1], decimate=None)
+    pipeline = replace(pipeline, filter=given, track=None)  # windows of several lengths are tried
     why = "decimation_cutoff (low-pass of torque and regressor) at the bandwidth, position_cutoff at twice that"
+    if not windows:
+        return [], Proposal(*cutoffs, None, why)
     if is_chain(pipeline.model.roles):  # such a robot is identified from the whole recording
         progress(0.3)
-        return [*findings, _whole(pipeline, recording)], Proposal(position_cutoff, decimation_cutoff, None, why)
-    findings += [_delay(pipeline, recording), *_robot(pipeline, recording, alone)]
+        return [_whole(pipeline, recording)], Proposal(*cutoffs, None, why)
+    findings = [_delay(pipeline, recording), *_robot(pipeline, recording, alone)]
     progress(0.3)
     window, of_windows = _window(pipeline, recording, alone, progress)
     why += "; the window that predicts the next one best: a longer one is more precise, a shorter one follows changes"
-    return [*findings, *of_windows], Proposal(position_cutoff, decimation_cutoff, window, f"{why} sooner")
+    return [*findings, *of_windows], Proposal(*cutoffs, window, f"{why} sooner")
 
 
 def coherent_bandwidth(recording: Recording) -> float:

@@ -164,6 +164,8 @@ class WindowJob:
     design: str | None = None
     """The trajectory.json of the design that the motion followed: it serves in place of both."""
     posterior: PosteriorSettings = field(default_factory=PosteriorSettings)
+    left_out: tuple[str, ...] = ()
+    """Which of the tables `filter` and `window` the job leaves to what suits the recording (`jobs.run.complete`)."""
     folder: Path = Path()
     """Where relative file names start."""
     text: str = ""
@@ -348,8 +350,6 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
             raise ValueError(f"[{name}] must be a table")
     model = model_settings(tables["model"])
     track = settings(TrackSettings, tables["track"], "track") if "track" in tables else None
-    if "window" not in tables and model.chain is None and track is None:
-        raise ValueError("the job has no [window] table: add one, or [track]")
     job = WindowJob(
         recording=several[0],
         more_recordings=tuple(several[1:]),
@@ -358,13 +358,14 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
         robot_recording_after=_of_robot(tables.get("robot_recording_after"), several[0]),
         payload=payload_settings(tables["payload"]) if "payload" in tables else None,
         model=model,
-        window=_window(tables.get("window", {}), model, track),
+        window=_window(tables.get("window", {}), track),
         track=track,
         filter=settings(FilterSettings, tables.get("filter", {}), "filter"),
         trust=settings(TrustLimits, tables.get("trust", {}), "trust"),
         reference_period=checked(tables.get("reference_period"), float | None, "reference_period"),
         design=checked(tables.get("design"), str | None, "design"),
         posterior=posterior_settings(tables.get("posterior", {})),
+        left_out=_left_out(tables, model, track),
         folder=folder,
         text=text,
     )
@@ -372,7 +373,7 @@ def parse_job(text: str, folder: Path = Path()) -> Job:
     return job
 
 
-def _window(table: Any, model: ModelSettings, track: TrackSettings | None) -> WindowSettings:
+def _window(table: Any, track: TrackSettings | None) -> WindowSettings:
     """`[window]`, whose length may be `"all"`, and stands for the stretches beside `[track]`."""
     if track is not None and isinstance(table, dict):
         if "step" in table:
@@ -383,10 +384,15 @@ def _window(table: Any, model: ModelSettings, track: TrackSettings | None) -> Wi
         raise ValueError("window.length is inf: it must be a number above zero, or 'all'")
     if given == "all":
         return settings(WindowSettings, {**table, "length": math.inf}, "window")
-    window = settings(WindowSettings, table, "window")
-    if given is None and model.chain is None:
-        raise ValueError("[window] has no 'length': add it")
-    return window
+    return settings(WindowSettings, table, "window")
+
+
+def _left_out(tables: Mapping[str, Any], model: ModelSettings, track: TrackSettings | None) -> tuple[str, ...]:
+    """Filters, and the length of windows; of a robot from its URDF these are the whole recording, and a path needs
+    none."""
+    left_out = ["filter"] if "filter" not in tables else []
+    own_length = model.chain is not None or track is not None or "length" in tables.get("window", {})
+    return (*left_out, *([] if own_length else ["window"]))
 
 
 def _inherited(table: Mapping[str, Any], recording: Mapping[str, Any]) -> Mapping[str, Any]:
