@@ -31,10 +31,8 @@ from jaximp.identification.rows import Measured, measure, regress_stack
 from jaximp.identification.solving import LAGS_GRAIN
 from jaximp.jobs.job import WindowJob
 from jaximp.recordings.errors import UnavailableError
+from jaximp.recordings.outputs import write_whole
 from jaximp.types import Recording, RobotAlone
-
-UNFINISHED = ".unfinished"
-"""End of a temporary name."""
 
 _one_at_a_time = Lock()
 """What may use LAPACK or draws figures: such programs can block each other (experiments/lapack_threads.py)."""
@@ -124,18 +122,6 @@ def earlier_inputs(out: Path) -> dict[str, tuple[str, str]]:
 def report_holds(task: Task, item: Item, earlier: Mapping[str, tuple[str, str]]) -> bool:
     """Whether the report of an earlier run is still that of this recording."""
     return earlier.get(item.name) == (job_checksum(task.job), input_checksum(item))
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """A file that appears whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
-    try:
-        with unfinished.open("wb") as file:
-            file.write(content)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 # --- reading and solving ----------------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ import pyarrow.parquet as pq
 from jaximp.batch.overview import Series, thinned, write_overview
 from jaximp.batch.plan import LOG, Batch, Item, Plan, find_items, make_plan, of_recordings
 from jaximp.batch.results import (
-    UNFINISHED,
     Interrupted,
     earlier_inputs,
     finished,
@@ -37,7 +36,6 @@ from jaximp.batch.results import (
     report_holds,
     report_wanted,
     write_late_report,
-    write_whole,
 )
 from jaximp.batch.tables import RUN_COLUMNS, reserved_columns
 from jaximp.batch.task import Task, load
@@ -46,7 +44,7 @@ from jaximp.jobs.job import Job, WindowJob
 from jaximp.numerics.cores import cores
 from jaximp.numerics.precision import require_float64
 from jaximp.plots.wording import main_parameter
-from jaximp.recordings.outputs import MARK
+from jaximp.recordings.outputs import MARK, UNFINISHED, write_whole
 from jaximp.trust.verdicts import TRUSTED
 from jaximp.types import nearest
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from jaximp.jobs.job import TrialsJob
 
 
-def check(job_file: JobFile) -> None:
+Write = Annotated[bool, typer.Option("--write", help="Write what is proposed into the job.")]
+
+
+def check(job_file: JobFile, write: Write = False) -> None:
     """Look at a recording before a run: sampling, gaps, saturation, noise, delay, excitation.
 
     Proposes cut-off frequencies and a window for the job file. Of perturbation trials it says how many there are, and
@@ -26,6 +29,8 @@ def check(job_file: JobFile) -> None:
 
     job = read_job(job_file)
     if isinstance(job, TrialsJob):
+        if write:
+            raise ValueError("of trials nothing is proposed that could be written: leave out --write")
         _check_trials(job)
         return
     with bar_of("checking") as progress:
@@ -40,6 +45,12 @@ def check(job_file: JobFile) -> None:
         f"\n# proposed: {proposal.why}\n[filter]\nposition_cutoff = {proposal.position_cutoff:g}\n"
         f"decimation_cutoff = {proposal.decimation_cutoff:g}{window}"
     )
+    if write:
+        from jaximp.jobs.proposals import with_proposal
+        from jaximp.recordings.outputs import write_whole
+
+        write_whole(job_file, with_proposal(job.text, proposal).encode())
+        typer.echo(f"written into {job_file}")
 
 
 def _check_trials(job: TrialsJob) -> None:

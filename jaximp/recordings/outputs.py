@@ -11,6 +11,20 @@ from pathlib import Path
 
 MARK = ".jaximp"
 """A file in every folder that jaximp made: `--force` replaces only such folders."""
+UNFINISHED = ".unfinished"
+"""How the name of a file ends until it is whole."""
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """A file that appears whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    try:
+        with unfinished.open("wb") as file:
+            file.write(content)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 @contextmanager

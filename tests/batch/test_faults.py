@@ -26,6 +26,7 @@ from jaximp.batch import task as batch_task
 from jaximp.batch.plan import find_items
 from jaximp.identification.prepared import Prepared
 from jaximp.jobs.job import parse_job
+from jaximp.recordings.outputs import UNFINISHED
 from jaximp.recordings.readers import formats
 from jaximp.recordings.save import save_recording
 
@@ -54,7 +55,7 @@ def full_disk(fault: Fault, out: Path) -> None:
 
     def fail(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.with_name(f".{path.name}.1{batch_results.UNFINISHED}").write_bytes(b"PAR1")
+        path.with_name(f".{path.name}.1{UNFINISHED}").write_bytes(b"PAR1")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     fault.after(4, fail)
@@ -68,7 +69,7 @@ def interrupt(fault: Fault, out: Path) -> None:
     fault.after(4, lambda path: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         run(fault.study, out)
-    assert not list(out.rglob(f"*{batch_results.UNFINISHED}"))
+    assert not list(out.rglob(f"*{UNFINISHED}"))
 
 
 def interrupt_while_garbage_is_collected(fault: Fault, out: Path) -> None:
@@ -326,6 +327,6 @@ def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 128 + signal.SIGTERM, error
     assert "Traceback" not in error
-    assert not list((tmp_path / "out").rglob(f"*{batch_results.UNFINISHED}"))
+    assert not list((tmp_path / "out").rglob(f"*{UNFINISHED}"))
     assert run(study, tmp_path / "out", resume=True).exit_status == 0
     assert content(tmp_path / "out") == content(study / "reference")
