@@ -102,12 +102,16 @@ def test_arms_that_cannot_be_simulated_are_refused(
 
 @pytest.mark.slow
 def test_demo_finds_the_step(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    assert run("demo", "--out", tmp_path / "demo")[0] == 0
+    status, said, _ = run("demo", "--out", tmp_path / "demo")
+    assert status == 0
+    assert "stiffness 60 until 12 s, then 120 N m/rad" in said
+    truth = json.loads((tmp_path / "demo" / "truth.json").read_text())
     table = pq.read_table(tmp_path / "demo" / "estimates.parquet").to_pydict()
-    end, trusted = np.array(table["end_s"]), np.array(table["verdict"]) == "trusted"
+    start, end, trusted = np.array(table["start_s"]), np.array(table["end_s"]), np.array(table["verdict"]) == "trusted"
     stiffness, stderr = np.array(table["stiffness"]), np.array(table["stiffness_stderr"])
     assert trusted.mean() > 0.7
-    for value, when in ((1e-3, trusted & (end < 10)), (2e-3, trusted & (end > 12))):
+    before, after = trusted & (end < truth["change_s"]), trusted & (start > truth["change_s"])
+    for value, when in zip(truth["stiffness"], (before, after), strict=True):
         assert np.abs((stiffness - value) / stderr)[when].max() < 4
         np.testing.assert_allclose(stiffness[when].mean(), value, rtol=0.03)
 
