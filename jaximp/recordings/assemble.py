@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,18 @@ from jaximp.recordings.raw import judge_raw
 from jaximp.types import Recording
 
 
-def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...], name: str) -> Recording:
-    """Check every channel, mask what is spoilt, take delays out, and bring all channels onto one uniform grid."""
+def assemble(
+    clock: Signal,
+    signals: dict[str, Signal],
+    joints: tuple[str, ...],
+    name: str,
+    of_file: Sequence[str] = (),
+    duplicates: str | None = None,
+) -> Recording:
+    """Check every channel, mask what is spoilt, take delays out, and bring all channels onto one uniform grid.
+
+    Notes on the file (`of_file`) stand before those on what was done here.
+    """
     _check_shapes(clock, signals, len(joints))
     stamps = clock.values[:, 0]
     check_stamps(clock.labels[0], stamps)
@@ -50,7 +61,7 @@ def assemble(clock: Signal, signals: dict[str, Signal], joints: tuple[str, ...],
         gain_covariance=None if gains is None else _frozen(gains),
         clipped=None if clipped is None else _frozen(clipped),
         name=name,
-        notes=(*of_sampling, *notes, *(fault.text for fault in judged.faults)),
+        notes=(*of_file, *of_sampling, *notes, *(fault.text for fault in judged.faults)),
         faults=judged.faults,
     )
 

@@ -22,8 +22,9 @@ from jaximp.recordings.assemble import assemble
 from jaximp.recordings.channels import CHANNELS, Signal, check_lengths, stack
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import take_clock
-from jaximp.recordings.mapping import Entry, check_mapping, given, is_number, joint_types, source_of
+from jaximp.recordings.mapping import Entry, check_mapping, given, is_number, joint_types, source_of, text_options
 from jaximp.recordings.readers.formats import read_columns
+from jaximp.recordings.readers.found import AS_SEEN, TextOptions
 from jaximp.recordings.units import to_si
 from jaximp.types import Recording
 
@@ -44,6 +45,12 @@ def load_recording(
     gear_ratio: float = 1.0,
     name: str | None = None,
     rows: Sequence[int] | None = None,
+    duplicates: str | None = None,
+    header: int | None = None,
+    separator: str | None = None,
+    decimal: str | None = None,
+    encoding: str | None = None,
+    bad_lines: str | None = None,
 ) -> Recording:
     """Read a recording; the keywords are the keys of a job file's `[recording]` table.
 
@@ -78,9 +85,12 @@ def load_recording(
     entries: dict[str, Any] = {"position": position, "torque": torque, "velocity": velocity, "force": force}
     entries |= {"acceleration": acceleration, "reference": reference, "command": command, "time": time}
     path = _existing(path)
+    written = {"header": header, "separator": separator, "decimal": decimal, "encoding": encoding}
     with _named(str(path)):
-        signals, joints = _read_signals(path, entries, sample_rate, joint, gear_ratio, rows)
-        return assemble(take_clock(signals, sample_rate), signals, joints, path.stem if name is None else name)
+        options = text_options({**written, "bad_lines": bad_lines})
+        signals, joints, notes = _read_signals(path, entries, sample_rate, joint, gear_ratio, rows, options)
+        clock = take_clock(signals, sample_rate)
+        return assemble(clock, signals, joints, _stem(path) if name is None else name, notes, duplicates)
 
 
 def recording_from_mapping(
@@ -166,7 +176,7 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
     channels = {key: mapping[key] for key in mapping if key in ("time", *CHANNELS)}
     options = (rate, mapping.get("joint", "revolute"), mapping.get("gear_ratio", 1.0), mapping.get("rows"))
     with _named(str(path)):
-        signals, joints = _read_signals(path, channels | {"trial": trial}, *options)
+        signals, joints, notes = _read_signals(path, channels | {"trial": trial}, *options, text_options(mapping))
         numbers = signals.pop("trial").values[:, 0]
         scalar = {key: signals.pop(key) for key in ("sample_rate",) if key in signals}
         check_lengths([(trial, numbers[:, None]), *((s.labels[0], s.values) for s in signals.values())])
@@ -179,7 +189,8 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
         rows = numbers == number
         with _named(f"{path}, trial {number:g}"):
             part = {key: replace(signal, values=signal.values[rows]) for key, signal in signals.items()} | scalar
-            recordings.append(assemble(take_clock(part, rate), part, joints, f"{path.stem}, trial {number:g}"))
+            name = f"{_stem(path)}, trial {number:g}"
+        recordings.append(assemble(take_clock(part, rate), part, joints, name, notes, mapping.get("duplicates")))
     return recordings
 
 
@@ -190,21 +201,29 @@ def _read_signals(
     joint: str | Sequence[str],
     gear_ratio: float,
     rows: Sequence[int] | None = None,
-) -> tuple[dict[str, Signal], tuple[str, ...]]:
-    """All channels of a file in SI units, the clock among them, and the joints; a `trial` column as it is."""
+    options: TextOptions = AS_SEEN,
+) -> tuple[dict[str, Signal], tuple[str, ...], list[str]]:
+    """All channels of a file in SI units, the clock among them, the joints, and notes on how the file was understood; a
+    `trial` column as it is."""
     if (entries.get("time") is None) == (sample_rate is None):
         raise RecordingError("give either 'time' (a column) or 'sample_rate' (in Hz), one of the two")
     entries = {**entries, "sample_rate": None if is_number(sample_rate) else sample_rate}
     sources = {channel: source_of(channel, entry) for channel, entry in entries.items() if given(channel, entry)}
-    columns = read_columns(path, [column for source in sources.values() for column in source.columns])
-    signals = {channel: stack(source.columns, columns) for channel, source in sources.items()}
+    found = read_columns(path, [column for source in sources.values() for column in source.columns], options)
+    signals = {channel: stack(source.columns, found.values) for channel, source in sources.items()}
     signals = {key: signal if key == "sample_rate" else _cut(signal, rows) for key, signal in signals.items()}
     joints = joint_types(joint, signals["position"].values.shape[1])
-    converted = {
-        key: signal if key == "trial" else to_si(key, signal, sources[key], joints, gear_ratio)
-        for key, signal in signals.items()
-    }
-    return converted, joints
+    notes = list(found.notes)
+    for key, signal in signals.items():
+        if key != "trial":
+            signals[key], taken = to_si(key, signal, sources[key], joints, gear_ratio, found)
+            notes += taken
+    return signals, joints, notes
+
+
+def _stem(path: Path) -> str:
+    """The name of a file without its extensions."""
+    return path.with_suffix("").stem if path.suffix.lower() == ".gz" else path.stem
 
 
 def _cut(signal: Signal, rows: Sequence[int] | None) -> Signal:

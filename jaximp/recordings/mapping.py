@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from jaximp.recordings.channels import CHANNELS
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.readers.found import TextOptions
 from jaximp.types import JOINT_TYPES, nearest
 
 Entry = str | int | Sequence[str | int] | Mapping[str, Any]
 """One channel of the mapping: a column by its name or number, a list of these, or `{columns, unit, sign, gain, delay}`.
 """
 
-KEYS = ("time", *CHANNELS, "sample_rate", "joint", "gear_ratio", "name", "rows")
+TEXT_KEYS = ("header", "separator", "decimal", "encoding", "bad_lines")
+"""Keys that say how a text file is written."""
+KEYS = ("time", *CHANNELS, "sample_rate", "joint", "gear_ratio", "name", "rows", "duplicates", *TEXT_KEYS)
 """The keys of a mapping, which are the keywords of `load_recording`."""
 
 
@@ -51,6 +54,8 @@ class Source:
     """Standard deviation of the sensor's error, in `unit`."""
     gain_error: GainError | None = None
     """What is not known of the gain."""
+    despite_name: bool = False
+    """Whether `unit` holds although the column's name says another."""
 
 
 def check_mapping(table: Mapping[str, Any], where: str, *others: str) -> None:
@@ -70,7 +75,7 @@ def source_of(channel: str, entry: Any) -> Source:
     options = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     measured = ["sign", "gain", "delay"] if channel not in ("time", "sample_rate") else []
     own = {"position": ["noise"], "torque": ["gain_error"]}.get(channel, [])
-    allowed = ["column", "columns", "unit", *measured, *own]
+    allowed = ["column", "columns", "unit", "despite_name", *measured, *own]
     for key in options:
         if key == "file":
             raise RecordingError(
@@ -94,7 +99,29 @@ def source_of(channel: str, entry: Any) -> Source:
     delay, noise = _delay(channel, options.get("delay", 0.0)), options.get("noise")
     if noise is not None and not (is_number(noise) and 0 < noise < math.inf):
         raise RecordingError(f"{channel}: noise must be the sensor's standard deviation, above 0, not {noise!r}")
-    return Source(columns, unit, float(sign), *gain, delay, noise, gain_error)
+    despite_name = options.get("despite_name", False)
+    if not isinstance(despite_name, bool):
+        raise RecordingError(f"{channel}: despite_name must be true or false, not {despite_name!r}")
+    return Source(columns, unit, float(sign), *gain, delay, noise, gain_error, despite_name)
+
+
+def text_options(given: Mapping[str, Any]) -> TextOptions:
+    """What a mapping says of how a text file is written, checked."""
+    for key, kind, example in (
+        ("header", int, "3, the line of the names"),
+        ("separator", str, '";" or "whitespace"'),
+        ("decimal", str, '","'),
+        ("encoding", str, '"cp1252"'),
+        ("bad_lines", str, '"drop"'),
+    ):
+        value = given.get(key)
+        if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
+            raise RecordingError(f"{key} must be such as {example}, not {value!r}")
+    if given.get("decimal") not in (None, ".", ","):
+        raise RecordingError(f'decimal must be "." or ",", not {given["decimal"]!r}')
+    if given.get("bad_lines") not in (None, "drop"):
+        raise RecordingError(f'bad_lines must be "drop", not {given["bad_lines"]!r}')
+    return TextOptions(**{key: given[key] for key in TEXT_KEYS if given.get(key) is not None})
 
 
 def columns_of(entry: Any) -> tuple[str | int, ...]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from jaximp.recordings.channels import CHANNELS
 from jaximp.recordings.errors import RecordingError
-from jaximp.recordings.units import SUFFIXES, si_unit
+from jaximp.recordings.named_units import SUFFIXES
+from jaximp.recordings.units import si_unit
 from jaximp.types import Recording
 
 

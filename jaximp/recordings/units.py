@@ -12,25 +12,27 @@ import numpy as np
 from jaximp.recordings.channels import Signal
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.mapping import Source, is_number
+from jaximp.recordings.named_units import Said, spelled, unit_in
+from jaximp.recordings.readers.found import Found
 from jaximp.types import Numbers
 
 _SI = {
     "revolute": {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2", "torque": "N m", "command": "N m"},
     "prismatic": {"position": "m", "velocity": "m/s", "acceleration": "m/s^2", "torque": "N", "command": "N"},
 }
-SUFFIXES = {
-    **{unit: unit for unit in ("deg", "mrad", "rad", "mm", "cm", "m", "s", "ms", "us", "N", "V", "Hz", "kHz", "rpm")},
-    **{"Nm": "N m", "mNm": "mN m", "rad_s": "rad/s", "deg_s": "deg/s", "m_s": "m/s", "mm_s": "mm/s"},
-    **{"rad_s2": "rad/s^2", "deg_s2": "deg/s^2", "m_s2": "m/s^2"},
-}
-"""What the end of a column's name says about its unit: `knee_deg`. Also names the columns that we write."""
-
 _UNIT = re.compile(r"(1|[A-Za-zµμ°Ω%_]+)((\^|\*\*)-?\d)?([ ·*/]+(1|[A-Za-zµμ°Ω%_]+)((\^|\*\*)-?\d)?)*")
 """Names of units with small exponents, and what may stand between them."""
 
 
-def to_si(channel: str, signal: Signal, source: Source, joints: tuple[str, ...], gear_ratio: float) -> Signal:
-    """The channel in SI units at the joint."""
+def to_si(
+    channel: str,
+    signal: Signal,
+    source: Source,
+    joints: tuple[str, ...],
+    gear_ratio: float,
+    found: Found | None = None,
+) -> tuple[Signal, list[str]]:
+    """The channel in SI units at the joint, and notes on units that were taken from the file (`found`)."""
     if not is_number(gear_ratio) or not 0 < gear_ratio < math.inf:
         raise RecordingError(f"gear_ratio must be a positive number, not {gear_ratio!r}")
     gear = {"torque": gear_ratio, "command": gear_ratio, "force": 1.0, "time": 1.0, "sample_rate": 1.0}.get(
@@ -39,7 +41,10 @@ def to_si(channel: str, signal: Signal, source: Source, joints: tuple[str, ...],
     # A force may have more columns than there are joints; for the other channels `assemble` reports a wrong count.
     kinds = [joints[min(i, len(joints) - 1)] for i in range(len(signal.labels))]
     units = [si_unit(channel, kind) for kind in kinds]
-    factors = [_unit_factor(channel, source, *pair) for pair in zip(signal.labels, units, strict=True)]
+    columns = [
+        _Column(channel, label, unit, found or Found({})) for label, unit in zip(signal.labels, units, strict=True)
+    ]
+    factors, notes = zip(*(_unit_factor(source, column) for column in columns), strict=True)
     with np.errstate(over="ignore"):
         factor = np.array(factors) * source.sign * _for_each(channel, "gain", source.gain or (1.0,), signal) * gear
         values = signal.values * factor
@@ -48,7 +53,7 @@ def to_si(channel: str, signal: Signal, source: Source, joints: tuple[str, ...],
         _for_each(channel, "gain_error", error.each, signal)
     covariance = None if error is None else error.covariance(len(signal.labels))
     noise = None if source.noise is None else float(source.noise * np.abs(factor).max())
-    return Signal(signal.labels, values, source.delay, noise, covariance)
+    return Signal(signal.labels, values, source.delay, noise, covariance), list(dict.fromkeys(filter(None, notes)))
 
 
 def _for_each(channel: str, key: str, given: tuple[float, ...], signal: Signal) -> Numbers:
@@ -66,32 +71,118 @@ def si_unit(channel: str, joint: str) -> str:
     return fixed.get(channel) or _SI[joint]["position" if channel == "reference" else channel]
 
 
-def _unit_factor(channel: str, source: Source, label: str, target: str) -> float:
-    """What brings a column (times the unit of its gain) to the unit `target`."""
-    if source.unit is None and source.gain is None:
-        _check_suffix(channel, re.sub(r"\[\d+\]$", "", label), target)
-    if source.gain_unit is None:
-        return _conversion(channel, target, source.unit or target)
-    return _conversion(channel, target, source.unit or "dimensionless", source.gain_unit)
+class _Column:
+    """One column, the unit that it shall have, and what the file says of the one it has."""
+
+    def __init__(self, channel: str, label: str, target: str, found: Found) -> None:
+        self.channel, self.target = channel, target
+        bare = re.sub(r"\[\d+\]$", "", label)
+        asked = {str(key): key for key in (*found.values, *found.names, *found.units)}
+        key = asked.get(label, asked.get(bare, bare))
+        self.column = key
+        self.name = found.names.get(key, bare)
+        text = found.units.get(key, "")
+        self.where = f"the file gives column {self.name!r} in" if text else f"the name of column {self.name!r} says"
+        self.said = Said(text, spelled(text)) if text.strip(" -1#") else unit_in(self.name)
+        if found.angles and self.said is None and channel in ANGULAR and target.startswith("rad"):
+            unit = target.replace("rad", found.angles)
+            self.said, self.where = Said(unit, unit), "the file says that its angles are in"
+
+    def line(self, rest: str) -> str:
+        """What to write into the mapping."""
+        column = self.column if isinstance(self.column, int) else f'"{self.column}"'
+        return f"{self.channel} = {{column = {column}, {rest}}}"
 
 
-def _check_suffix(channel: str, column: str, target: str) -> None:
-    """Refuse to read `knee_deg` in radians because nobody said otherwise."""
-    suffix = max((suffix for suffix in SUFFIXES if column.endswith("_" + suffix)), key=len, default=None)
-    if suffix and SUFFIXES[suffix] != target:
+ANGULAR = ("position", "velocity", "acceleration", "reference")
+"""Channels that are angles, or their derivatives, at a revolute joint."""
+
+
+def _unit_factor(source: Source, column: _Column) -> tuple[float, str]:
+    """What brings a column (times the unit of its gain) to the unit that it shall have, and a note."""
+    channel, target, said = column.channel, column.target, column.said
+    if source.unit is not None and source.gain is None:
+        factor = _conversion(channel, target, source.unit)
+        _refuse_contradiction(source, column, factor)
+        return factor, ""
+    if source.gain_unit is not None:
+        named = said.unit if source.unit is None and said is not None else None
+        if named not in (None, "count"):
+            try:
+                return _conversion(channel, target, str(named), source.gain_unit), _taken(column, str(named))
+            except RecordingError:
+                pass
+        return _conversion(channel, target, source.unit or "dimensionless", source.gain_unit), ""
+    if source.unit is not None or said is None or said.unit == target or source.despite_name:
+        return _conversion(channel, target, source.unit or target), ""
+    return _by_name(source, column, said)
+
+
+def _by_name(source: Source, column: _Column, said: Said) -> tuple[float, str]:
+    """The factor of the unit that a name says, and a note; refused where that cannot be meant."""
+    channel, target = column.channel, column.target
+    if said.unit is None:
+        if len(said.text) > 3 and said.text.replace(" ", "").isalpha():
+            return (
+                1.0,
+                f"{channel}: '{said.text}' of column {column.name!r} is taken for no unit: it is read in '{target}'",
+            )
         raise RecordingError(
-            f"{channel}: the name of column {column!r} says '{SUFFIXES[suffix]}', but without a unit it would be read "
-            f'in \'{target}\'; state the unit: {channel} = {{column = "{column}", unit = "{SUFFIXES[suffix]}"}}'
+            f"{channel}: {column.where} '{said.text}', which is no unit that is known; state it: "
+            + column.line(f'unit = "{target}"')
+        )
+    if source.gain is not None:
+        raise RecordingError(
+            f"{channel}: {column.where} '{said.unit}', and a gain without a unit gives what? State the unit "
+            "of the product: " + column.line(f'gain = {source.gain[0]:g}, unit = "{target}"')
+        )
+    try:
+        factor = _conversion(channel, target, said.unit)
+    except RecordingError:
+        how = f'gain = "0.00153 {target}"' if said.unit == "count" else f'gain = "1.5 ({target})/{said.unit}"'
+        remedy = column.line(f'unit = "{said.unit}"') if _same_kind(said.unit, target) else column.line(how)
+        raise RecordingError(
+            f"{channel}: {column.where} '{said.unit}', but without a unit it would be read in '{target}'; state the "
+            f'unit ("{target}"), or how much one is: {remedy}'
+        ) from None
+    return factor, _taken(column, said.unit)
+
+
+def _same_kind(unit: str, target: str) -> bool:
+    return unit.startswith(target[:3])
+
+
+def _taken(column: _Column, unit: str) -> str:
+    return f"{column.channel}: {column.where} '{unit}': taken as that"
+
+
+def _refuse_contradiction(source: Source, column: _Column, factor: float) -> None:
+    """A name that says degrees and a mapping that says radians: one of them is wrong."""
+    said = column.said
+    if said is None or said.unit is None or source.despite_name:
+        return
+    try:
+        named = _conversion(column.channel, column.target, said.unit)
+    except RecordingError:
+        return
+    if not math.isclose(named, factor, rel_tol=1e-9):
+        raise RecordingError(
+            f"{column.channel}: {column.where} '{said.unit}', and the mapping '{source.unit}'; write "
+            f'unit = "{said.unit}", or if the name is wrong: '
+            + column.line(f'unit = "{source.unit}", despite_name = true')
         )
 
 
 @lru_cache(maxsize=256)
 def _conversion(channel: str, target: str, *units: str) -> float:
     """The factor from the product of `units` to `target`. Plain spellings of `target` do not need pint."""
+    units = tuple(spelled(unit) or unit for unit in units)
     if len(units) == 1 and units[0].replace("Nm", "N m").replace("N*m", "N m").replace("**", "^") == target:
         return 1.0
     registry = _unit_registry()
     product = registry.Quantity(1.0)
+    if units == ("count",):
+        raise RecordingError(f'{channel}: how much is a count? Write it as a gain: gain = "0.00153 {target}"')
     for unit in units:
         try:
             # The pattern keeps everything but units and small exponents away from pint's expression parser.

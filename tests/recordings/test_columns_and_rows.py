@@ -73,7 +73,7 @@ def test_a_broken_row_without_header_is_named(tmp_path: Path) -> None:
     lines = path.read_text().splitlines()
     lines[6] = lines[6].rsplit(",", 1)[0]
     path.write_text("\n".join(lines))
-    with pytest.raises(ValueError, match=matches("row 7 has 4 fields, the first row 5")):
+    with pytest.raises(ValueError, match=matches("the first is row 7 (it has 4 fields, the others 5")):
         load_recording(path, **COLUMNS)
 
 

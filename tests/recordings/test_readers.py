@@ -164,9 +164,9 @@ def test_other_bad_files(tmp_path: Path) -> None:
     (tmp_path / "noise.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match=matches("is not UTF-8 text")):
         load_recording(tmp_path / "noise.csv", **MAPPING)
-    (tmp_path / "latin.csv").write_bytes("t,q°,tau\n".encode("latin1"))
-    with pytest.raises(ValueError, match=matches("is not UTF-8 text; save it with that encoding")):
-        load_recording(tmp_path / "latin.csv", **MAPPING)
+    (tmp_path / "neither.csv").write_bytes(b"t,q\x81,tau\n0,1,2\n")
+    with pytest.raises(ValueError, match=matches("is not cp1252 text, nor UTF-8; save it with that encoding")):
+        load_recording(tmp_path / "neither.csv", **MAPPING)
     (tmp_path / "twice.csv").write_text("t,q,q,tau\n0,1,2,3\n")
     with pytest.raises(ValueError, match=matches("column 'q' appears more than once")):
         load_recording(tmp_path / "twice.csv", **MAPPING)

@@ -202,7 +202,7 @@ NAN, INF = float("nan"), float("inf")
         pytest.param(changed(tau={4: "1,5"}), "is not a number", id="decimal-comma"),
         pytest.param(changed(tau={4: "broken"}), "column 'tau', row 5: 'broken' is not a number", id="text"),
         pytest.param(changed(tau={4: "1_0"}), "column 'tau', row 5: '1_0' is not a number", id="underscore"),
-        pytest.param(changed(tau={4: "1,5,6"}), "row 5 has 5 fields, the header 3", id="ragged"),
+        pytest.param(changed(tau={4: "1,5,6"}), "the first is row 5 (it has 5 fields, the others 3", id="ragged"),
         pytest.param({"t": [], "q": [], "tau": []}, "has 0 samples; at least 3 are needed", id="header-only"),
         pytest.param({"t": [0, 1], "q": [0, 1], "tau": [0, 1]}, "has 2 samples; at least 3", id="too-short"),
         pytest.param({"t": [0], "angle": [0], "tau": [0]}, "column 'q' is not there; there are: 't',", id="no-column"),
@@ -246,7 +246,12 @@ def test_bad_data(tmp_path: Path, columns: dict[str, Any], message: str) -> None
         pytest.param({"joint": "revolut"}, "did you mean 'revolute'?", id="joint"),
         pytest.param({"joint": ["revolute"] * 2}, "2 types for 1 position columns", id="joint-count"),
         pytest.param({"velocity": ["q1", "tau"]}, "velocity has 2 columns for 1 joints", id="joint-columns"),
-        pytest.param({"position": "knee_deg"}, 'state the unit: position = {column = "knee_deg"', id="suffix"),
+        pytest.param(
+            {"position": {"column": "knee_deg", "unit": "rad"}},
+            "column 'knee_deg' says 'deg', and the mapping 'rad'; write unit = \"deg\", or if the name is wrong: "
+            'position = {column = "knee_deg", unit = "rad", despite_name = true}',
+            id="suffix",
+        ),
         pytest.param({"velocity": "knee_rad"}, "'knee_rad' says 'rad', but without a unit", id="suffix-rad"),
         pytest.param({"position": "short"}, "'t' has 50 samples, but 'short' has 40", id="lengths"),
         pytest.param({"position": ["q1", "short"]}, "'q1' has 50 samples, but 'short' has 40", id="lengths-in-list"),
@@ -265,10 +270,10 @@ def test_bad_mapping(tmp_path: Path, change: dict[str, Any], message: str) -> No
 
 
 @pytest.mark.parametrize("suffix", ["mrad", "rad"])
-def test_a_stated_unit_wins_over_the_name(tmp_path: Path, suffix: str) -> None:
+def test_a_stated_unit_wins_over_a_name_that_is_said_to_be_wrong(tmp_path: Path, suffix: str) -> None:
     columns = signals()
     np.savez(tmp_path / "a.npz", **columns, **{f"x_{suffix}": columns["q"]})
-    entry = {"column": f"x_{suffix}", "unit": "deg"}
+    entry = {"column": f"x_{suffix}", "unit": "deg", "despite_name": True}
     recording = load_recording(tmp_path / "a.npz", **(MAPPING | {"position": entry}))
     np.testing.assert_allclose(recording.position[:, 0], columns["q"] * DEG)
 
@@ -320,7 +325,7 @@ def test_a_command_is_a_force(tmp_path: Path) -> None:
     )
     save_recording(recording, tmp_path / "r.csv")
     columns: dict[str, Any] = {"time": "time_s", "position": "position_rad", "torque": "torque_Nm"}
-    command = {"column": "command_Nm", "unit": "mN m"}
+    command = {"column": "command_Nm", "unit": "mN m", "despite_name": True}
     read = load_recording(tmp_path / "r.csv", command=command, gear_ratio=2.0, **columns)
     np.testing.assert_allclose(read.command, 2e-3 * np.asarray(recording.command))
     with pytest.raises(ValueError, match="command: unit 'deg' does not convert"):

@@ -7,32 +7,34 @@ imported in the function that needs them. Nothing is ever unpickled.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jaximp.recordings.errors import RecordingError, UnavailableError
 from jaximp.recordings.readers import hdf5, mat, npz, parquet, text
+from jaximp.recordings.readers.disguise import refuse_disguise
+from jaximp.recordings.readers.found import AS_SEEN, Found, TextOptions
 
 
 @dataclass(frozen=True)
 class Format:
     """A kind of file, and how it is read."""
 
-    read: Callable[[Path, list[Any]], Mapping[Any, Any]]
+    read: Callable[..., Found]
     """The named columns of a file. What its library raises, `read_columns` puts into words."""
     count: Callable[[Path, list[Any]], int]
     """How many samples a file says that it holds of some columns, without reading them; zero where it does not say."""
     matrices: bool = False
     """Whether one variable may hold several columns, one per joint."""
-    numbered: bool = False
-    """Whether columns can be asked for by number, from 1."""
+    text: bool = False
+    """Whether columns can be asked for by number, from 1, and `read` takes `TextOptions`."""
 
 
 FORMATS = {
-    **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count, numbered=True)),
-    ".parquet": Format(parquet.read, parquet.count),
+    **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count, text=True)),
+    ".parquet": Format(parquet.read, parquet.count, matrices=True),
     ".mat": Format(mat.read, mat.count, matrices=True),
     **dict.fromkeys((".h5", ".hdf5"), Format(hdf5.read, hdf5.count, matrices=True)),
     ".npz": Format(npz.read, npz.count, matrices=True),
@@ -42,16 +44,31 @@ MATRICES = tuple(extension for extension, kind in FORMATS.items() if kind.matric
 """Extensions of files in which one variable may hold several columns."""
 
 
-def read_columns(path: Path, names: Sequence[str | int]) -> Mapping[str | int, Any]:
+def format_of(path: Path) -> Format | None:
+    """By its extension, which stands before `.gz` where a text file was packed."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    if suffixes[-1:] == [".gz"]:
+        inner = FORMATS.get(suffixes[-2]) if len(suffixes) > 1 else FORMATS[".txt"]
+        return inner if inner is not None and inner.text else None
+    return FORMATS.get(path.suffix.lower())
+
+
+def read_columns(path: Path, names: Sequence[str | int], options: TextOptions = AS_SEEN) -> Found:
     """The named columns of a file; whatever a reader's library raises becomes one line."""
-    kind = FORMATS.get(path.suffix.lower())
+    kind = format_of(path)
     if kind is None:
         raise RecordingError(f"cannot read '{path.suffix}' files; use one of: {', '.join(FORMATS)}")
+    if options.given() and not kind.text:
+        raise RecordingError(
+            f"{options.given()[0]}: this key is for text files, and '{path.suffix}' is none; remove it"
+        )
     numbers = [name for name in names if isinstance(name, int)]
-    if numbers and not kind.numbered:
+    if numbers and not kind.text:
         raise RecordingError(f"column {numbers[0]}: numbers are for text files, give its name")
     try:
-        return kind.read(path, list(dict.fromkeys(names)))
+        refuse_disguise(path)
+        wanted = list(dict.fromkeys(names))
+        return kind.read(path, wanted, options) if kind.text else kind.read(path, wanted)
     except (RecordingError, MemoryError):
         raise
     except UnicodeDecodeError:
@@ -69,7 +86,7 @@ def count_samples(path: Path, names: Sequence[str | int]) -> int:
 
     **Raises:** `RecordingError` for a variable that must not be read. What else is wrong, `read_columns` says.
     """
-    kind = FORMATS.get(path.suffix.lower())
+    kind = format_of(path)
     try:
         return 0 if kind is None else kind.count(path, list(names))
     except (RecordingError, MemoryError):

@@ -1,37 +1,140 @@
-"""HDF5: a column is a dataset's path, such as `run/q`."""
+"""HDF5: a column is a dataset's path, such as `run/q`, a column of it, `run/q[2]`, or a field of a table, `log/q`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaximp.recordings.errors import RecordingError
-from jaximp.recordings.readers.columns import largest, require
+from jaximp.recordings.readers.columns import Index, head_of, largest, pick, require, require_variable, steps_of
+from jaximp.recordings.readers.found import Found
 
 
-def read(path: Path, names: list[str], matlab: bool = False) -> dict[str, Any]:
-    """The datasets of these paths; errors write a path as MATLAB does if that wrote the file: `data.q`."""
+def read(path: Path, names: Sequence[str], matlab: bool = False) -> Found:
+    """The datasets of these paths, or parts of them; errors write a path as MATLAB does if that wrote the file:
+    `data.q`, and its arrays are turned round."""
     import h5py
 
-    def datasets(file: Any) -> list[str]:
-        found: list[str] = []
-        file.visititems(lambda key, item: found.append(key) if isinstance(item, h5py.Dataset) else None)
-        return [key.replace("/", ".") if matlab else key for key in found if not key.startswith("#")]
+    notes: list[str] = []
+    with h5py.File(path, "r") as file:
+        return Found({name: _value(file, name, matlab, notes) for name in names}, notes=tuple(notes))
 
+
+def _value(file: Any, name: str, matlab: bool, notes: list[str]) -> Any:
+    dataset, steps = _find(file, name, matlab)
+    kind = dataset.attrs.get("MATLAB_class")
+    if kind == b"char":
+        raise RecordingError(f"variable {name!r} holds text, not numbers; name a numeric variable")
+    if dataset.attrs.get("MATLAB_object_decode") is not None or kind in (
+        b"table",
+        b"timetable",
+        b"timeseries",
+        b"string",
+    ):
+        raise RecordingError(unreadable(head_of(name), (kind or b"object").decode()))
+    value = dataset[()]
+    return pick(np.transpose(value) if matlab else value, steps, name, notes)
+
+
+def _find(file: Any, name: str, matlab: bool) -> tuple[Any, list[str | Index]]:
+    """The dataset that a name begins with, and what of it is meant."""
+    import h5py
+
+    if isinstance(file.get(name), h5py.Dataset):
+        return _own(file, name), []
+    head, steps = steps_of(name)
+    node, place = file.get(head.lstrip("./")) if head.lstrip("./") else file, None
+    _require_node(file, node, name, matlab)
+    while steps and isinstance(node, h5py.Group):
+        step = steps.pop(0)
+        if isinstance(step, Index):
+            place = step
+            continue
+        if step not in node:
+            require(step, _datasets(file, matlab) if not matlab else list(node), f"column {name!r}")
+        node = node[step]
+        if isinstance(node, h5py.Dataset) and matlab and node.dtype == object:
+            node, place = _of_array(file, node, place, name), None
+    _require_node(file, node, name, matlab)
+    if place is not None:
+        raise RecordingError(
+            f"column {name!r} is not there: it is one struct, and no array of them; leave {place.text}"
+        )
+    if not isinstance(node, h5py.Dataset):
+        require(name, _datasets(file, matlab))
+    return _own(file, node.name), steps
+
+
+def _of_array(file: Any, references: Any, place: Index | None, name: str) -> Any:
+    """The dataset of one struct of an array of structs."""
+    count = references.size
+    if place is None and count != 1:
+        before, _, field = name.rpartition(".")
+        raise RecordingError(f"{before!r} is an array of {count} structs: name one, such as {before}(1).{field}")
+    at = 0 if place is None else place.at[0]
+    if at is None or at >= count:
+        raise RecordingError(f"column {name!r} is not there: the array has {count} structs")
+    return file[references[()].ravel()[at]]
+
+
+def _require_node(file: Any, node: Any, name: str, matlab: bool) -> None:
+    import h5py
+
+    if node is None:
+        shapes: dict[str, tuple[int, ...]] = {}
+        file.visititems(
+            lambda key, item: (
+                shapes.update({key: item.shape[:: -1 if matlab else 1]})
+                if isinstance(item, h5py.Dataset) and not key.startswith("#")
+                else None
+            )
+        )
+        require_variable(name, {key.replace("/", ".") if matlab else key: shape for key, shape in shapes.items()}, name)
+
+
+def _datasets(file: Any, matlab: bool) -> list[str]:
+    import h5py
+
+    found: list[str] = []
+    file.visititems(lambda key, item: found.append(key) if isinstance(item, h5py.Dataset) else None)
+    return [key.replace("/", ".") if matlab else key for key in found if not key.startswith("#")]
+
+
+def unreadable(name: str, kind: str) -> str:
+    """What is said of a MATLAB object, which only MATLAB reads."""
+    how = {
+        "table": f"save it with s = table2struct({name}, 'ToScalar', true)",
+        "timetable": f"save it with s = table2struct(timetable2table({name}), 'ToScalar', true)",
+        "timeseries": f"save {name}.Time and {name}.Data as variables of their own",
+        "string": f"save it as char({name}), or leave it",
+        "datetime": f"save seconds({name} - {name}(1))",
+        "duration": f"save seconds({name})",
+    }.get(kind, "save its numbers as plain variables")
+    a = "an object" if kind == "object" else f"a {kind}"
+    return (
+        f"{name!r} is a MATLAB {kind}, which only MATLAB reads: {how}"
+        if kind != "object"
+        else (f"{name!r} is {a} of MATLAB, which only MATLAB reads: {how}")
+    )
+
+
+def count(path: Path, names: Sequence[str], matlab: bool = False) -> int:
+    import h5py
+
+    shapes = {}
     with h5py.File(path, "r") as file:
         for name in names:
-            if not isinstance(file.get(name), h5py.Dataset):
-                require(name.replace("/", ".") if matlab else name, datasets(file))
-            if _own(file, name).attrs.get("MATLAB_class") == b"char":
-                raise RecordingError(f"variable {name!r} holds text, not numbers; name a numeric variable")
-        return {name: file[name][()] for name in names}
-
-
-def count(path: Path, names: list[str]) -> int:
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return largest({name: _own(file, name).shape for name in names if name in file}, names)
+            try:
+                dataset, _ = _find(file, name, matlab)
+            except RecordingError as error:
+                if "lies in another file" in str(error):
+                    raise
+                continue
+            shapes[name] = dataset.shape
+    return largest(shapes, list(names))
 
 
 def _own(file: Any, name: str) -> Any:

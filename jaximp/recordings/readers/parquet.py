@@ -1,35 +1,105 @@
-"""Parquet, column by column."""
+"""Parquet and Feather, column by column; a column of lists has a column for each place, `q[2]`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaximp.recordings.errors import RecordingError
-from jaximp.recordings.readers.columns import require
+from jaximp.recordings.readers.columns import head_of, pick, require, steps_of
+from jaximp.recordings.readers.found import Found
 
 THREADS_PAY = 200_000
 """Rows of a file from which its columns are read at the same time: to hand over small ones takes longer."""
 
 
-def read(path: Path, names: list[str]) -> dict[str, Any]:
-    import pyarrow
+def read(path: Path, names: Sequence[str]) -> Found:
     from pyarrow import parquet
 
     with parquet.ParquetFile(path, pre_buffer=False) as file:
-        schema = file.schema_arrow
-        for name in names:
+        heads = _heads(names, file.schema_arrow)
+        table = file.read(columns=list({*heads.values()}), use_threads=file.metadata.num_rows > THREADS_PAY)
+    return _columns(table, heads)
+
+
+def read_feather(path: Path, names: Sequence[str]) -> Found:
+    import pyarrow
+    from pyarrow import feather
+
+    with pyarrow.memory_map(str(path)) as source:
+        table = feather.read_table(source)
+        return _columns(table, _heads(names, table.schema))
+
+
+def _heads(names: Sequence[str], schema: Any) -> dict[str, str]:
+    """The column that each name begins with."""
+    heads = {name: name if name in schema.names else head_of(name) for name in names}
+    for name, head in heads.items():
+        if head not in schema.names:
             require(name, schema.names)
-            kind = schema.field(name).type
-            if not (
-                pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind) or pyarrow.types.is_decimal(kind)
-            ):
-                raise RecordingError(f"column {name!r} holds {kind}, not numbers; store it as numbers in a known unit")
-        table = file.read(columns=names, use_threads=file.metadata.num_rows > THREADS_PAY)
-    return {name: table[name].cast(pyarrow.float64(), safe=False).to_numpy() for name in names}
+        _check_kind(head, schema.field(head).type)
+    return heads
 
 
-def count(path: Path, names: list[str]) -> int:
+def _check_kind(name: str, kind: Any) -> None:
+    from pyarrow import types
+
+    if types.is_struct(kind):
+        return
+    inner = (
+        kind.value_type if types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind) else kind
+    )
+    if types.is_timestamp(inner) or types.is_duration(inner):
+        return
+    if not (types.is_integer(inner) or types.is_floating(inner) or types.is_decimal(inner)):
+        raise RecordingError(f"column {name!r} holds {kind}, not numbers; store it as numbers in a known unit")
+
+
+def _columns(table: Any, heads: dict[str, str]) -> Found:
+    notes: list[str] = []
+    values = {}
+    for name, head in heads.items():
+        steps = [] if name == head else steps_of(name)[1]
+        column = table[head].combine_chunks()
+        while steps and isinstance(field := steps[0], str):
+            import pyarrow
+
+            steps = steps[1:]
+            if not pyarrow.types.is_struct(column.type):
+                raise RecordingError(f"column {name!r} is not there: {head!r} has no fields")
+            require(field, [one.name for one in column.type], f"field {field!r} of {name!r}")
+            column = column.field(field)
+        values[name] = pick(_numbers(name, column), steps, name, notes)
+    return Found(values, notes=tuple(notes))
+
+
+def _numbers(name: str, column: Any) -> Any:
+    """(N,), or (N, k) of lists that are equally long."""
+    import numpy as np
+    import pyarrow
+    import pyarrow.compute as pc
+    from pyarrow import types
+
+    kind = column.type
+    if types.is_timestamp(kind) or types.is_duration(kind):
+        if len(column) and column.null_count == 0:
+            column = pc.cast(pc.subtract(pc.cast(column, "int64"), pc.cast(column[0], "int64")), "int64")
+            return np.asarray(column) / {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
+        raise RecordingError(f"column {name!r}: a time stamp is missing; remove the row")
+    if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
+        lengths = pc.unique(pc.list_value_length(column)).to_pylist()
+        if len(lengths) != 1 or lengths[0] is None:
+            raise RecordingError(f"column {name!r} holds lists of {len(lengths)} lengths; write lists of one length")
+        flat = pc.list_flatten(column)
+        return np.asarray(pc.cast(flat, pyarrow.float64(), safe=False)).reshape(len(column), lengths[0])
+    if types.is_struct(kind):
+        raise RecordingError(f"column {name!r} has fields: name one, such as {name}.{kind[0].name}")
+    _check_kind(name, kind)
+    return column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False)
+
+
+def count(path: Path, names: Sequence[str]) -> int:
     from pyarrow import parquet
 
     with path.open("rb") as file:
