@@ -22,13 +22,19 @@ def identify(job_file: JobFile, out: OutBeside = None, force: Force = False) -> 
     """Estimate the parameters in every window of a recording, or along a path that follows them, or the impedance of an
     arm from perturbation trials.
 
+    A recording in place of the job is identified as the job that `init` would write for it.
+
     Writes estimates.parquet (one row per window, or one per method), summary.json, report.html and the figures into
     the folder.
     """
-    from jaximp.jobs.job import read_job
+    from jaximp.jobs.first_job import read_job_or_recording
     from jaximp.recordings.outputs import new_folder
 
-    job, out = read_job(job_file), out_beside(job_file, out, "results")
+    with bar_of("looking into the file") as progress:
+        job = read_job_or_recording(job_file, progress)
+    if job_file.suffix.lower() != ".toml":
+        typer.echo(job.text)
+    out = out_beside(job_file, out, "results")
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
         identify_into(job, folder)
     say_where(out)

@@ -1,4 +1,4 @@
-"""The command line: `jaximp demo | check | identify | batch | posterior | design | export | simulate | reproduce`.
+"""The command line: `jaximp demo`, `init`, `check`, `identify`, `posterior`, `design`, `batch` and others.
 
 One command a file. A file imports what its command needs when that runs: help must not wait for it.
 """
@@ -22,6 +22,7 @@ from jaximp.cli.demo import demo
 from jaximp.cli.design import design
 from jaximp.cli.export import export
 from jaximp.cli.identify import identify
+from jaximp.cli.init import init
 from jaximp.cli.posterior import posterior
 from jaximp.cli.reproduce import reproduce
 from jaximp.cli.simulate import simulate
@@ -34,8 +35,8 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Identify the mechanical impedance of human joints, and the dynamics of the robots that hold them.\n\n"
-    "Begin with `jaximp demo`, then write a job file for your own recording: `jaximp check JOB.toml` looks at the data "
-    "and proposes filters and a window, `jaximp identify JOB.toml --out DIR` writes estimates and a report.",
+    "Begin with `jaximp demo`. For your own recording, `jaximp init FILE` writes a first job, `jaximp check JOB.toml` "
+    "looks at the data, and `jaximp identify JOB.toml` writes estimates and a report.",
 )
 
 
@@ -90,5 +91,5 @@ def options(
     """What can be asked of jaximp itself."""
 
 
-for each in (demo, check, identify, posterior, design, export, simulate, batch, reproduce):
+for each in (demo, init, check, identify, posterior, design, export, simulate, batch, reproduce):
     app.command()(prepared(each))

@@ -142,7 +142,7 @@ def test_every_paper_can_be_reproduced() -> None:
     assert there == {paper.value for paper in Paper} == {"tout2023", "lakatos2011", "borner2020"}
 
 
-COMMANDS = ["demo", "check", "identify", "posterior", "design", "export", "simulate", "batch", "reproduce"]
+COMMANDS = ["demo", "init", "check", "identify", "posterior", "design", "export", "simulate", "batch", "reproduce"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -145,3 +145,13 @@ def _own(file: Any, name: str) -> Any:
     if isinstance(found, h5py.Dataset) and (found.file != file or found.external or found.is_virtual):
         raise RecordingError(f"{name!r} lies in another file; copy its numbers into this one")
     return found
+
+
+def shapes(path: Path, matlab: bool = False) -> dict[str, tuple[int, ...]]:
+    """Of every dataset."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        names = _datasets(file, matlab)
+        own = [file[name.replace(".", "/") if matlab else name] for name in names]
+        return {name: one.shape[:: -1 if matlab else 1] for name, one in zip(names, own, strict=True)}

@@ -121,3 +121,21 @@ def _variable(head: bytes, order: Literal["little", "big"]) -> Variable:
         return Variable(elements[1].decode("latin1"), kind, of=of)
     shape = tuple(int.from_bytes(elements[1][k : k + 4], order) for k in range(0, len(elements[1]), 4))
     return Variable(elements[2].decode("latin1"), kind, shape)
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Of every variable of numbers, and of the fields of a struct."""
+    import h5py
+
+    if h5py.is_hdf5(path):
+        return hdf5.shapes(path, matlab=True)
+    from scipy.io import loadmat
+
+    found: dict[str, tuple[int, ...]] = {}
+    for one in _walk(path)[1].values():
+        if one.kind == STRUCT and int(np.prod(one.shape)) == 1:
+            fields = loadmat(path, variable_names=[one.name])[one.name]
+            found |= {f"{one.name}.{name}": np.shape(fields[name].item()) for name in fields.dtype.names or ()}
+        elif one.kind not in (OBJECT, STRUCT, CELL):
+            found[one.name] = one.shape
+    return {name: tuple(size for size in shape if size != 1) or (1,) for name, shape in found.items()}

@@ -52,3 +52,8 @@ def _shapes(path: Path, wanted: Any = None) -> dict[str, tuple[int, ...]]:
                 read_header = npy.read_array_header_1_0 if first else npy.read_array_header_2_0
                 shapes[name] = tuple(read_header(opened)[0])
     return shapes
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Of every array."""
+    return _shapes(path)

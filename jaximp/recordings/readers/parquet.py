@@ -110,3 +110,15 @@ def count(path: Path, names: Sequence[str]) -> int:
         max([group.num_rows, *(group.column(j).num_values for j in range(group.num_columns))]) for group in groups
     ]
     return max(int(about.num_rows), sum(longest))
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """The columns of numbers; how many a column of lists holds only its rows say."""
+    from pyarrow import parquet, types
+
+    schema = parquet.read_schema(path)
+    return {
+        field.name: ()
+        for field in schema
+        if types.is_integer(field.type) or types.is_floating(field.type) or types.is_timestamp(field.type)
+    }

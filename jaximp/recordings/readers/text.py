@@ -403,6 +403,14 @@ def count(path: Path, names: Sequence[str | int]) -> int:
     return max(0, lines - first + (last != b"\n"))
 
 
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """What the columns of a file are called: names, or numbers from 1 where it has no header."""
+    content, _ = _decoded(_bytes_of(path), AS_SEEN)
+    layout = layout_of(_first_lines(content), AS_SEEN)
+    names = layout.names or tuple(map(str, range(1, layout.width + 1)))
+    return dict.fromkeys(names, ())
+
+
 def delimiter_of(header: str) -> str:
     """What separates the columns that a header names: comma, semicolon or tab."""
     return max(",;\t", key=header.count)
