@@ -107,9 +107,9 @@ def _unit_factor(source: Source, column: _Column) -> tuple[float, str]:
         return factor, ""
     if source.gain_unit is not None:
         named = said.unit if source.unit is None and said is not None else None
-        if named not in (None, "count"):
+        if named is not None:
             try:
-                return _conversion(channel, target, str(named), source.gain_unit), _taken(column, str(named))
+                return _conversion(channel, target, named, source.gain_unit), _taken(column, named)
             except RecordingError:
                 pass
         return _conversion(channel, target, source.unit or "dimensionless", source.gain_unit), ""

@@ -35,6 +35,7 @@ class Format:
 FORMATS = {
     **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count, text=True)),
     ".parquet": Format(parquet.read, parquet.count, matrices=True),
+    ".feather": Format(parquet.read_feather, parquet.count_feather, matrices=True),
     ".mat": Format(mat.read, mat.count, matrices=True),
     **dict.fromkeys((".h5", ".hdf5"), Format(hdf5.read, hdf5.count, matrices=True)),
     ".npz": Format(npz.read, npz.count, matrices=True),

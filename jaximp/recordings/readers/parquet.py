@@ -122,3 +122,9 @@ def shapes(path: Path) -> dict[str, tuple[int, ...]]:
         for field in schema
         if types.is_integer(field.type) or types.is_floating(field.type) or types.is_timestamp(field.type)
     }
+
+
+def count_feather(path: Path, names: Sequence[str]) -> int:
+    from pyarrow import dataset
+
+    return int(dataset.dataset(path, format="feather").count_rows())
