@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximp.recordings.channels import Signal, check_lengths
+from jaximp.recordings.clocks import without_repeats
 from jaximp.recordings.delays import without_delay
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import check_stamps, on_uniform_grid
@@ -29,12 +30,14 @@ def assemble(
     Notes on the file (`of_file`) stand before those on what was done here.
     """
     _check_shapes(clock, signals, len(joints))
+    clock, signals, of_clock = without_repeats(clock, signals, duplicates)
     stamps = clock.values[:, 0]
     check_stamps(clock.labels[0], stamps)
     labels = [label for signal in signals.values() for label in signal.labels]
     valid, notes = _complete_rows(labels, _side_by_side(signals))
     for channel in ("position", "torque"):
         notes += _check_motion(channel, signals[channel], valid)
+    notes += _same_numbers(signals)
     judged = judge_raw(stamps, signals, valid)
     moved = {channel: without_delay(signal, stamps, judged.valid) for channel, signal in judged.signals.items()}
     notes += [_moved_in_words(channel, signal.delay) for channel, signal in signals.items() if signal.delay]
@@ -61,7 +64,7 @@ def assemble(
         gain_covariance=None if gains is None else _frozen(gains),
         clipped=None if clipped is None else _frozen(clipped),
         name=name,
-        notes=(*of_file, *of_sampling, *notes, *(fault.text for fault in judged.faults)),
+        notes=(*of_file, *of_clock, *of_sampling, *notes, *(fault.text for fault in judged.faults)),
         faults=judged.faults,
     )
 
@@ -130,6 +133,15 @@ def _check_enough(valid: NDArray[np.bool_]) -> None:
         raise RecordingError(
             f"only {valid.sum()} of {len(valid)} samples are usable (no NaN, no gap); record at least 3"
         )
+
+
+def _same_numbers(signals: dict[str, Signal]) -> list[str]:
+    """A note where position and torque are one column: they say nothing of a joint."""
+    pairs = list(zip(signals["position"].values.T, signals["torque"].values.T, strict=False))
+    same = [bool(np.array_equal(x, y, equal_nan=True) and np.nanmin(x) < np.nanmax(x)) for x, y in pairs]
+    of = [f" of joint {k + 1}" if len(pairs) > 1 else "" for k in np.flatnonzero(same)]
+    what = "are the same numbers: a stiffness of 1 is all that can come out; name the column of the other"
+    return [f"position and torque{one} {what}" for one in of]
 
 
 def _check_motion(channel: str, signal: Signal, valid: NDArray[np.bool_]) -> list[str]:

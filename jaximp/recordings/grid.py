@@ -39,7 +39,7 @@ def take_clock(signals: dict[str, Signal], sample_rate: Any) -> Signal:
 
 
 def check_stamps(label: str, stamps: NDArray[np.float64]) -> None:
-    """Time stamps are finite and increase."""
+    """Time stamps are finite, and increase: what can be said of those that do not, `clocks` has said."""
     unusable = np.flatnonzero(~np.isfinite(stamps))
     if len(unusable):
         row = unusable[0] + 1
