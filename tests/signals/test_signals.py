@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -412,3 +413,11 @@ def test_quantisation_step_of_an_encoder(step: float, offset: float) -> None:
 )
 def test_no_quantisation_step_where_none_can_be_seen(x: NDArray[np.float64]) -> None:
     assert quantisation_step(x) == 0.0
+
+
+def test_slow_filters_of_fast_recordings_warn_of_nothing() -> None:
+    """Their coefficients are tiny: nothing but their poles is asked for."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = reach(butterworth(8, 4.0, 1000.0), 0.01)
+    assert 0.3 * 250 < found < 4 * 250
