@@ -28,7 +28,7 @@ from jaximp.tracking.state_space import (
 )
 
 BANK = 32
-"""Filters of each model."""
+"""Filters of each model, at least."""
 
 
 class _Bank(NamedTuple):
@@ -47,7 +47,7 @@ def filtered(
     `log_jump` logarithm of the probability that a parameter jumps within `every` points, which lie between two splits,
     and `moving` (p,) which may: without any a single filter runs for each model."""
     points, p = len(rows), rows.shape[-1] - 1
-    bank = BANK if len(moving) else 1
+    bank = max(BANK, 2 * p) if len(moving) else 1
     wide = jax.tree.map(lambda x: x[:, None], motion)
     known = start(motion)
     known = jnp.broadcast_to(known[:, :, None], (*known.shape[:2], bank, known.shape[2]))
@@ -80,15 +80,14 @@ def _mixed(
 
 def _split(at: _Bank, moving: Array, log_jump: Array) -> _Bank:
     """The most probable filter, with a jump of each parameter, in the place of the least probable ones."""
-    p, best = len(moving), jnp.argmax(at.log_weight, axis=0)
-    order = jnp.argsort(at.log_weight, axis=0)
-    lanes, d = jnp.arange(len(best)), len(at.known)
     known, evidence, log_weight = at
-    for i in range(p):
-        child, less = widened(at.known[:, :, best, lanes], d - p + i, jnp.asarray(moving[i], known.dtype))
-        place = order[i], lanes
-        gone = log_jump + jnp.where(moving[i], less / 2, -1e6)
-        known = known.at[(slice(None), slice(None), *place)].set(child)
-        evidence = evidence.at[place].set(at.evidence[best, lanes] + gone)
-        log_weight = log_weight.at[place].set(at.log_weight[best, lanes] + gone)
-    return _Bank(known, evidence, log_weight)
+    p, d, lanes = len(moving), len(known), jnp.arange(evidence.shape[1])
+    best, place = jnp.argmax(log_weight, axis=0), (jnp.argsort(log_weight, axis=0)[:p], lanes)
+    parent = known[:, :, best, lanes]
+    child, less = widened(parent[:, :, None], parent[:, d - p : d], jnp.asarray(moving, known.dtype)[:, None])
+    gone = log_jump + jnp.where(moving[:, None], less / 2, -1e6)
+    return _Bank(
+        known.at[:, :, *place].set(child),
+        evidence.at[place].set(evidence[best, lanes] + gone),
+        log_weight.at[place].set(log_weight[best, lanes] + gone),
+    )

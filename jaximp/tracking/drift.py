@@ -11,7 +11,7 @@ are drawn, and weighted by their likelihood: what is not known of the drift is i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +31,7 @@ JUMPS = 1.0
 MOST_JUMPS = 16
 ROUNDS = 3
 """How often the drift sizes of all parameters are looked at in turn, at most."""
-LANES, DRAWN = 24, 120
+LANES, DRAWN = 20, 120
 """Models that are compared side by side, and how many are drawn around the best."""
 NONE = -1
 
@@ -134,6 +134,8 @@ class Search:
     choices: tuple[Numbers, ...]
     """Of each parameter the rates that are tried: the first is zero, but where the rate is given."""
     jumping: bool
+    found: dict[tuple[object, ...], Numbers] = field(default_factory=dict, compare=False, repr=False)
+    """What was asked for already: by turns the same models come up again."""
 
     @property
     def points(self) -> int:
@@ -184,16 +186,22 @@ class Search:
         some = self.choices[i]
         models = model[np.zeros(len(some), int)]
         models.rate[i] = some
-        return self.log_likelihood(models)[0] + self.log_prior(i)
+        key = (i, *(x.tobytes() for x in (models.rate, model.at, model.which)))
+        if key not in self.found:
+            self.found[key] = self.log_likelihood(models)[0] + self.log_prior(i)
+        return self.found[key]
 
     def of_jump(self, model: Model) -> Numbers:
         """(1 + p G,) logarithm of the probability of no further jump, and of one of each parameter at each point."""
-        found, seen = _shocks(self.blocks.rows, model.motion(self.information, self.order))
-        scale = (float(found.squares[0]) + float(self.blocks.left)) / float(self.blocks.freedom)
-        odds = np.asarray(seen.log_odds(jnp.asarray([scale])))[..., 0]  # (G, p)
-        odds = np.where(self.moving, odds + self.log_jump, -np.inf)
-        odds[0] = -np.inf
-        return np.append(0.0, odds.T.ravel())
+        key = tuple(x.tobytes() for x in (model.rate, model.at, model.which))
+        if key not in self.found:
+            found, seen = _shocks(self.blocks.rows, model.motion(self.information, self.order))
+            scale = (float(found.squares[0]) + float(self.blocks.left)) / float(self.blocks.freedom)
+            odds = np.asarray(seen.log_odds(jnp.asarray([scale])))[..., 0]  # (G, p)
+            odds = np.where(self.moving, odds + self.log_jump, -np.inf)
+            odds[0] = -np.inf
+            self.found[key] = np.append(0.0, odds.T.ravel())
+        return self.found[key]
 
     def best(self) -> Model:
         """From parameters that stay: their drift first, or their jumps first."""

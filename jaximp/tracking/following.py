@@ -20,6 +20,7 @@ from jaximp.tracking.state_space import (
     moments,
     own_triangle,
     smoother,
+    solved,
     triangularise,
 )
 from jaximp.types import AnyArray, Numbers
@@ -137,11 +138,8 @@ def _innovations(rows: Float[Array, "G r f"], before: Float[Array, "d e G"]) -> 
     # Rows of `[1 spread]` have the covariance that was expected: its triangle standardises them, one after the other.
     whole = jnp.concatenate([jnp.eye(r)[..., None] + jnp.zeros_like(surprise), spread], axis=1)
     upper, _ = triangularise(jnp.moveaxis(whole, 1, 0), r)
-    found: list[Array] = []
-    for i in range(r):
-        rest = surprise[i] - sum((upper[k, i] * found[k] for k in range(i)), jnp.zeros_like(surprise[i]))
-        found.append(rest / upper[i, i])
-    return jnp.stack(found, axis=1)
+    last_first = jnp.swapaxes(upper, 0, 1)[::-1, ::-1]
+    return solved(last_first, surprise[::-1, None])[::-1, 0].T
 
 
 _merged = compiled(merged, static_argnums=1)

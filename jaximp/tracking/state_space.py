@@ -19,19 +19,22 @@ discrete sequential estimation, 1977; two passes: Fraser and Potter 1969; jumps:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaximp.numerics.lanes import inverse_of_rows, substitute
+from jaximp.numerics.compilation import keep
+from jaximp.numerics.lanes import divided, sum_of
 
 T = TypeVar("T")
 
 PRIOR = 100.0
 """Standard deviation of parameters before anything is measured, in their own scale."""
+WRITTEN_OUT, FEW_TERMS = 4, 64
+"""Loops of so many steps at most are written out, and sums of so many terms: larger ones take long to compile."""
 NOTHING = 1e-6
 """Root of the information behind the record. Of none at all a triangle would have no derivative."""
 
@@ -90,18 +93,33 @@ def triangularise(rows: Float[Array, "m n *L"], pivots: int) -> tuple[Float[Arra
 
     Columns need not be independent: a pivot is then zero, or rounding.
     """
-    triangle: list[Array] = []
-    for _ in range(pivots):
-        column, rows = rows[:, 0], rows[:, 1:]
-        square = (column * column).sum(axis=0)
+    columns = jnp.arange(rows.shape[1]).reshape(-1, *(1,) * (rows.ndim - 2))
+
+    def eliminate(j: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        rows, triangle = state
+        column = rows[:, j]
+        square = _summed(column, column)
         positive = square > 0
-        pivot = jnp.sqrt(jnp.where(positive, square, 1))
-        unit = jnp.where(positive, column / pivot, 0)
-        along = (unit[:, None] * rows).sum(axis=0)
-        rows = rows - unit[:, None] * along
-        nothing = jnp.zeros((len(triangle), *square.shape), rows.dtype)
-        triangle.append(jnp.concatenate([nothing, jnp.where(positive, pivot, 0)[None], along]))
-    return jnp.stack(triangle), rows
+        unit = keep(jnp.where(positive, column / jnp.sqrt(jnp.where(positive, square, 1)), 0))
+        along = keep(_summed(unit[:, None], rows))
+        return keep(rows - unit[:, None] * along), triangle.at[j].set(jnp.where(columns >= j, along, 0))
+
+    rows, triangle = for_each(pivots, eliminate, (rows, jnp.zeros((pivots, *rows.shape[1:]), rows.dtype)))
+    return triangle, rows[:, pivots:]
+
+
+def _summed(a: Float[Array, "m ..."], b: Float[Array, "m ..."]) -> Array:
+    """Sum over the first axis of `a * b`. XLA adds few terms, one after the other, for many lanes at a time."""
+    return sum_of(x * y for x, y in zip(a, b, strict=True)) if len(a) <= FEW_TERMS else (a * b).sum(axis=0)
+
+
+def for_each(count: int, body: Callable[[Any, T], T], state: T) -> T:
+    """`body(i, state)` for all i in turn: written out where there are few, and else a loop, which is compiled once."""
+    if count > WRITTEN_OUT:
+        return jax.lax.fori_loop(0, count, body, state)
+    for i in range(count):
+        state = body(i, state)
+    return state
 
 
 def start(motion: Motion) -> Float[Array, "d e L"]:
@@ -133,34 +151,46 @@ def _stepped(known: Array, motion: Motion, sign: float) -> Array:
 
 def _less_certain(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Array]:
     """Potter's formula for the random part of a step, one state after the other."""
-    own = motion.walk + jumps
-    one = jnp.ones_like(own[0])
-    random = [] if motion.order == 0 else [(i, one) for i in range(len(own))]
-    random += [(motion.order * len(own) + i, variance) for i, variance in enumerate(own)]
-    lost = jnp.zeros_like(one)
-    for i, variance in random:
-        known, less = widened(known, i, variance)
-        lost = lost + less
-    return known, lost
+    own, p = motion.walk + jumps, len(motion.walk)
+
+    def widen(first: int, variance: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        def one(i: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            known, less = widened(state[0], state[0][:, first + i], variance[i])
+            return known, state[1] + less
+
+        return for_each(p, one, state)
+
+    state = known, jnp.zeros_like(known[0, 0])
+    if motion.order == 0:
+        return widen(0, own, state)
+    state = widen(0, jnp.ones_like(own), state)
+    # What is smooth has no random step of its own but for jumps, which are rare.
+    return jax.lax.cond((own > 0).any(), lambda state: widen(motion.order * p, own, state), lambda state: state, state)
 
 
-def widened(known: Array, i: int, variance: Array) -> tuple[Array, Array]:
-    """What is known once state i has had a random step of this variance, and what that takes off: see `moved`."""
-    column = known[:, i]
-    share = 1 / (1 + variance * (column * column).sum(axis=0))
+def widened(known: Array, column: Array, variance: Array) -> tuple[Array, Array]:
+    """What is known once the state of this column has had a random step of this variance, and what that takes off: see
+    `moved`."""
+    share = 1 / (1 + variance * _summed(column, column))
     gain = variance * share / (1 + jnp.sqrt(share))
-    return known - gain * column[:, None] * (column[:, None] * known).sum(axis=0), jnp.log(share)
+    along = keep(gain * _summed(column[:, None], known))
+    return keep(known - column[:, None] * along), jnp.log(share)
 
 
 def with_rows(known: Array, rows: Float[Array, "r f *L"]) -> tuple[Array, Array]:
-    """What is known with a block's rows, a triangle, and the squares that it leaves."""
-    triangle, left = triangularise(jnp.concatenate([known, _of_lanes(rows, known)]), len(known))
-    return triangle, (left[:, 0] ** 2).sum(axis=0)
+    """What is known with a block's rows, a triangle, and the squares that it leaves.
+
+    The rows know nothing of slopes, which come first.
+    """
+    p = rows.shape[1] - 1
+    above, rest = triangularise(known, len(known) - p)
+    below, left = triangularise(jnp.concatenate([rest, _of_lanes(rows, rest)]), p)
+    below = jnp.concatenate([jnp.zeros((p, len(above), *below.shape[2:]), below.dtype), below], axis=1)
+    return jnp.concatenate([above, below]), (left[:, 0] ** 2).sum(axis=0)
 
 
 def _of_lanes(rows: Float[Array, "r f *L"], known: Array) -> Array:
-    """A block's rows in terms of the whole state, for every lane."""
-    rows = jnp.pad(rows, ((0, 0), (known.shape[1] - rows.shape[1], 0), *((0, 0),) * (rows.ndim - 2)))
+    """A block's rows, for every lane."""
     rows = rows.reshape(*rows.shape, *(1,) * (known.ndim - rows.ndim))
     return jnp.broadcast_to(rows, (len(rows), *known.shape[1:]))
 
@@ -196,8 +226,8 @@ def smoother(
 ) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
     """Parameters at each point and their covariance, from the whole record; `before` as `forward` gives it."""
 
-    def look(known: Array, _: Array) -> tuple[Array, Array]:
-        theta, root = moments(own_triangle(known, rows.shape[2] - 1))
+    def look(known: Array, earlier: Array) -> tuple[Array, Array]:
+        theta, root = moments(own_triangle(jnp.concatenate([earlier, known]), rows.shape[2] - 1))
         return theta, covariance_of(root)
 
     return _backward(rows, motion, before, look)
@@ -207,12 +237,12 @@ def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, 
     """What a jump of each parameter in front of each point would explain; `before` as `forward` gives it."""
     d, p = before.shape[1], rows.shape[2] - 1
 
-    def look(all_rows: Array, earlier: Array) -> Shocks:
+    def look(known: Array, earlier: Array) -> Shocks:
         # Before a jump by delta, the state was less by it.
-        jump = jnp.zeros((len(all_rows), p, *all_rows.shape[2:]), rows.dtype).at[:d].set(-earlier[:, -p - 1 : -1])
-        whole = jnp.concatenate([all_rows[:, :-1], jump, all_rows[:, -1:]], axis=1)
-        triangle = triangularise(whole, d + p)[0][d:, -p - 1 :]
-        return Shocks((triangle[:, :p] * triangle[:, p:]).sum(axis=0), (triangle[:, :p] ** 2).sum(axis=0))
+        jump = jnp.concatenate([-earlier[:, -p - 1 : -1], jnp.zeros_like(known[:, -p - 1 : -1])])
+        both = jnp.concatenate([earlier, known])
+        left = triangularise(jnp.concatenate([both[:, :-1], jump, both[:, -1:]], axis=1), d)[1]
+        return Shocks((left[:, :p] * left[:, p:]).sum(axis=0), (left[:, :p] ** 2).sum(axis=0))
 
     return _backward(rows, motion, before, look)
 
@@ -220,18 +250,16 @@ def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, 
 def _backward(
     rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"], look: Callable[[Array, Array], T]
 ) -> T:
-    """The record from its end: `look` sees all rows that are known of a point, and those of the points before it."""
-
-    d = before.shape[1]
+    """The record from its end: `look` sees what the points from each one on know of it, and those before it."""
 
     def step(behind: Array, now: tuple[Array, Array, Array]) -> tuple[Array, T]:
         k, block, earlier = now
-        own = _of_lanes(block, behind)
-        seen = look(jnp.concatenate([earlier, own, behind]), earlier)
-        known, _ = triangularise(jnp.concatenate([behind, own]), len(behind))
+        known, _ = with_rows(behind, block)
+        seen = look(known, earlier)
         known, _ = _less_certain(known, motion, motion.jump_variance(k))
         return _stepped(known, motion, 1.0), seen
 
+    d = before.shape[1]
     nothing = jnp.broadcast_to(NOTHING * jnp.eye(d, d + 1, dtype=rows.dtype)[..., None], before.shape[1:])
     return jax.lax.scan(step, nothing, (jnp.arange(len(rows)), rows, before), reverse=True)[1]
 
@@ -243,11 +271,24 @@ def own_triangle(known: Float[Array, "m e *K"], p: int) -> Float[Array, "p f *K"
 
 def moments(triangle: Float[Array, "p f *K"]) -> tuple[Float[Array, "p *K"], Float[Array, "p p *K"]]:
     """Parameters and a root of their covariance, `root @ root'`, from their triangle."""
-    p, shape = len(triangle), triangle.shape[2:]
-    flat = triangle.reshape(p, p + 1, -1)
-    rows = tuple(flat[i, i:] for i in range(p))
-    root = inverse_of_rows(tuple(row[:-1] for row in rows))
-    return jnp.stack(substitute(rows, p)).reshape(p, *shape), root.reshape(p, p, *shape)
+    p = len(triangle)
+    unit = jnp.broadcast_to(
+        jnp.eye(p, dtype=triangle.dtype).reshape(p, p, *(1,) * (triangle.ndim - 2)), triangle[:, 1:].shape
+    )
+    found = solved(triangle[:, :p], jnp.concatenate([triangle[:, p:], unit], axis=1))
+    return found[:, 0], found[:, 1:]
+
+
+def solved(triangle: Float[Array, "p p *K"], right: Float[Array, "p k *K"]) -> Float[Array, "p k *K"]:
+    """`triangle^-1 @ right`, from its last row up."""
+    p = len(triangle)
+
+    def substitute(i: Any, found: Array) -> Array:
+        k = p - 1 - i
+        rest = right[k] - _summed(triangle[k][:, None], found)  # what is not yet found counts as zero
+        return found.at[k].set(keep(divided(rest, triangle[k, k])))
+
+    return for_each(p, substitute, jnp.zeros_like(right))
 
 
 def covariance_of(root: Float[Array, "p p *K"]) -> Float[Array, "p p *K"]:
