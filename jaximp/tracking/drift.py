@@ -15,11 +15,12 @@ from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaximp.numerics.compilation import compiled
 from jaximp.tracking.blocks import Blocks
-from jaximp.tracking.state_space import Evidence, Motion, Shocks, evidence, forward, shocks
+from jaximp.tracking.state_space import Motion, evidence, forward, shocks
 from jaximp.types import Numbers
 
 SHORTEST, PER_OCTAVE = 4.0, 2
@@ -52,10 +53,10 @@ class Model:
 
     def motion(self, information: Numbers, order: int) -> Motion:
         """The same in steps, see `step_of`. Slopes may begin with what they become within a memory."""
-        step = jnp.asarray(step_of(self.rate, information[:, None], order))
+        step = step_of(self.rate, information[:, None], order)
         walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
         memory = 1 / np.where(self.rate > 0, self.rate, 1)  # where a parameter stays its slopes do not matter
-        return Motion(walk, slope, jnp.asarray(memory), jnp.asarray(self.at), jnp.asarray(self.which), order)
+        return Motion(*map(jnp.asarray, (walk, slope, memory, self.at, self.which)), order)
 
     def finer(self, every: int, inside: NDArray[np.int64]) -> Model:
         """On a grid with `every` points for one, jumps being at the points `inside` (J, L)."""
@@ -86,9 +87,11 @@ _evidence = compiled(evidence)
 
 
 @compiled
-def _shocks(rows: jnp.ndarray, motion: Motion) -> tuple[Evidence, Shocks]:
-    found, before = forward(rows, motion)
-    return found, shocks(rows, motion, before)
+def _log_odds(blocks: Blocks, motion: Motion) -> Array:
+    """(G, p) of a jump in front of each point, for the first of the models; see `Shocks`."""
+    found, before = forward(blocks.rows, motion)
+    scale = (found.squares + blocks.left) / blocks.freedom
+    return shocks(blocks.rows, motion, before).log_odds(scale)[..., 0]
 
 
 @dataclass(frozen=True)
@@ -195,9 +198,7 @@ class Search:
         """(1 + p G,) logarithm of the probability of no further jump, and of one of each parameter at each point."""
         key = tuple(x.tobytes() for x in (model.rate, model.at, model.which))
         if key not in self.found:
-            found, seen = _shocks(self.blocks.rows, model.motion(self.information, self.order))
-            scale = (float(found.squares[0]) + float(self.blocks.left)) / float(self.blocks.freedom)
-            odds = np.asarray(seen.log_odds(jnp.asarray([scale])))[..., 0]  # (G, p)
+            odds = np.asarray(_log_odds(self.blocks, model.motion(self.information, self.order)))
             odds = np.where(self.moving, odds + self.log_jump, -np.inf)
             odds[0] = -np.inf
             self.found[key] = np.append(0.0, odds.T.ravel())

@@ -84,7 +84,7 @@ def follow(fine: Blocks, found: Found, seed: int) -> Followed:
         return models[lanes].motion(information, search.order), jnp.asarray(drawn.scale[lanes])
 
     shown, moving = drawn.some(SHOWN), search.moving & search.jumping
-    best = jnp.argmax(jnp.asarray(drawn.log_weight[shown]))
+    best = jnp.asarray(np.argmax(drawn.log_weight[shown]))
     theta, covariance, innovations = _path(fine.rows, *motion(shown), best)
     causal = _filtered(
         fine.rows, *motion(drawn.some(CAUSAL)), jnp.asarray(search.log_jump),

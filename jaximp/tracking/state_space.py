@@ -65,10 +65,10 @@ class Motion(eqx.Module):
 class Shocks(NamedTuple):
     """What a jump of one parameter in front of a point would explain: evidence for its size."""
 
-    score: Float[Array, "p G L"]
-    information: Float[Array, "p G L"]
+    score: Float[Array, "G p L"]
+    information: Float[Array, "G p L"]
 
-    def log_odds(self, scale: Array) -> Float[Array, "p G L"]:
+    def log_odds(self, scale: Array) -> Float[Array, "G p L"]:
         """Logarithm of the likelihood with a jump of the size of the parameter, over that without; `scale` (L,) squared
         of the noise."""
         wider = 1 + self.information
