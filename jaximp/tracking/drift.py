@@ -56,7 +56,8 @@ class Model:
         step = step_of(self.rate, information[:, None], order)
         walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
         memory = 1 / np.where(self.rate > 0, self.rate, 1)  # where a parameter stays its slopes do not matter
-        return Motion(*map(jnp.asarray, (walk, slope, memory, self.at, self.which)), order)
+        walk, slope, memory, at, which = map(jnp.asarray, (walk, slope, memory, self.at, self.which))
+        return Motion(walk, slope, memory, at, which, order)
 
     def finer(self, every: int, inside: NDArray[np.int64]) -> Model:
         """On a grid with `every` points for one, jumps being at the points `inside` (J, L)."""

@@ -31,6 +31,8 @@ ORDERS, KINDS = (0, 1, 2), (0, 1)
 """How often a random walk may be integrated, and the kinds of motion that are weighed against each other."""
 ROUNDS, SETTLED = 5, 1e-3
 """How often paths are followed where drift sizes are given, until the noise is as large as it was taken to be."""
+TOGETHER = 128
+"""Records that are followed side by side: for more the processor's nearest memory is too small."""
 NEGLIGIBLE = 1e-3
 """A kind of motion that is less probable than this is not followed."""
 
@@ -132,22 +134,37 @@ def smoothed_paths(
     valid: Shaped[AnyArray, "R N *n"] | None = None,
 ) -> tuple[Path, Float[Array, " R"]]:
     """`smoothed_path` of R records of one length, side by side: much faster than one after the other, or by `vmap`."""
-    counts = jnp.ones(jnp.shape(y), bool) if valid is None else jnp.asarray(valid, bool)
     records, p = W.shape[0], W.shape[-1]
+    counts = jnp.ones(jnp.shape(y), bool) if valid is None else jnp.asarray(valid, bool)
+    each = (
+        W, y, counts, jnp.broadcast_to(jnp.asarray(drift, float), (records, p)),
+        jnp.broadcast_to(jnp.asarray(noise, float), (records,)),
+    )  # fmt: skip
+    lanes = min(records, TOGETHER)
+    whole = -(-records // lanes) * lanes  # the last one again, where some lanes would have none
+    each = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], whole - records, axis=0)]), each)
+    each = jax.tree.map(lambda x: x.reshape(-1, lanes, *x.shape[1:]), each)
+    found = jax.lax.map(lambda some: _side_by_side(*some, grid=grid, order=order), each)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:records], found)
+
+
+def _side_by_side(
+    W: Array, y: Array, counts: Array, drift: Array, noise: Array, *, grid: int, order: int
+) -> tuple[Path, Float[Array, " R"]]:
+    """`smoothed_paths` of as many as the nearest memory of a processor can hold."""
     rows = jnp.moveaxis(jax.vmap(partial(as_blocks, grid=grid))(W, y, counts).rows, 0, -1)
     size = root((rows**2).sum(axis=(0, 1)))
     unit = jnp.where(size[:-1] > 0, size[-1] / jnp.where(size[:-1] > 0, size[:-1], 1), 1)
-    noise = jnp.broadcast_to(jnp.asarray(noise, float), (records,))
-    rows = rows * (jnp.concatenate([unit, jnp.ones((1, records))]) / noise)
+    rows = rows * (jnp.concatenate([unit, jnp.ones_like(unit[:1])]) / noise)
 
-    step = jnp.broadcast_to(jnp.asarray(drift, float), (records, p)).T / unit
+    step = drift.T / unit
     walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
-    none = jnp.full((0, records), NONE)
+    none = jnp.full((0, len(noise)), NONE)
     motion = Motion(walk, slope, jnp.full_like(step, len(rows)), none, none, order)
     found, before = forward(rows, motion)
     theta, covariance = smoother(rows, motion, before)
     theta, covariance = jnp.moveaxis(theta * unit, -1, 0), jnp.moveaxis(covariance * unit[:, None] * unit, -1, 0)
-    log_noise = counts.reshape(records, -1).sum(axis=1) * (jnp.log(noise) + 0.5 * math.log(2 * math.pi))
+    log_noise = counts.reshape(len(counts), -1).sum(axis=1) * (jnp.log(noise) + 0.5 * math.log(2 * math.pi))
     return Path(theta, covariance), found.log_determinant - found.squares / 2 - log_noise
 
 

@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 PRIOR = 100.0
 """Standard deviation of parameters before anything is measured, in their own scale."""
-WRITTEN_OUT, FEW_TERMS = 4, 64
+WRITTEN_OUT, FEW_TERMS = 6, 64
 """Loops of so many steps at most are written out, and sums of so many terms: larger ones take long to compile."""
 NOTHING = 1e-6
 """Root of the information behind the record. Of none at all a triangle would have no derivative."""
@@ -88,24 +88,49 @@ class Evidence(NamedTuple):
         return self.log_determinant - freedom / 2 * jnp.log((self.squares + left) / freedom)
 
 
-def triangularise(rows: Float[Array, "m n *L"], pivots: int) -> tuple[Float[Array, "d n *L"], Float[Array, "m k *L"]]:
+def triangularise(
+    rows: Float[Array, "m n *L"], pivots: int, full: int | None = None
+) -> tuple[Float[Array, "d n *L"], Float[Array, "m k *L"]]:
     """Upper triangle of the first columns of rows, by modified Gram-Schmidt, and what it leaves of the others.
 
-    Columns need not be independent: a pivot is then zero, or rounding.
+    Columns need not be independent: a pivot is then zero, or rounding. Rows are a triangle from row `full` on.
     """
+    if pivots == 0:
+        return rows[:0], rows
+    if pivots > WRITTEN_OUT:
+        return _triangularise_in_a_loop(rows, pivots)
+    triangle: list[Array] = []
+    for j in range(pivots):
+        begun = len(rows) if full is None else full + j + 1
+        column, others = rows[:begun, 0], rows[:begun, 1:]
+        unit, pivot = _unit(column)
+        along = keep(_summed(unit[:, None], others))
+        rows = keep(jnp.concatenate([others - unit[:, None] * along, rows[begun:, 1:]]))
+        nothing = jnp.zeros((j, *pivot.shape), rows.dtype)
+        triangle.append(jnp.concatenate([nothing, pivot[None], along]))
+    return jnp.stack(triangle), rows
+
+
+def _triangularise_in_a_loop(rows: Array, pivots: int) -> tuple[Array, Array]:
     columns = jnp.arange(rows.shape[1]).reshape(-1, *(1,) * (rows.ndim - 2))
 
-    def eliminate(j: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def eliminate(j: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, triangle = state
-        column = rows[:, j]
-        square = _summed(column, column)
-        positive = square > 0
-        unit = keep(jnp.where(positive, column / jnp.sqrt(jnp.where(positive, square, 1)), 0))
+        unit, _ = _unit(rows[:, j])
         along = keep(_summed(unit[:, None], rows))
         return keep(rows - unit[:, None] * along), triangle.at[j].set(jnp.where(columns >= j, along, 0))
 
-    rows, triangle = for_each(pivots, eliminate, (rows, jnp.zeros((pivots, *rows.shape[1:]), rows.dtype)))
+    start = rows, jnp.zeros((pivots, *rows.shape[1:]), rows.dtype)
+    rows, triangle = jax.lax.fori_loop(0, pivots, eliminate, start)
     return triangle, rows[:, pivots:]
+
+
+def _unit(column: Float[Array, "m *L"]) -> tuple[Float[Array, "m *L"], Float[Array, "*L"]]:
+    """The column divided by its length, and this; both zero for no column at all."""
+    square = _summed(column, column)
+    positive = square > 0
+    pivot = jnp.sqrt(jnp.where(positive, square, 1))
+    return keep(jnp.where(positive, column / pivot, 0)), jnp.where(positive, pivot, 0)
 
 
 def _summed(a: Float[Array, "m ..."], b: Float[Array, "m ..."]) -> Array:
@@ -226,8 +251,11 @@ def smoother(
 ) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
     """Parameters at each point and their covariance, from the whole record; `before` as `forward` gives it."""
 
+    d, p = before.shape[1], rows.shape[2] - 1
+
     def look(known: Array, earlier: Array) -> tuple[Array, Array]:
-        theta, root = moments(own_triangle(jnp.concatenate([earlier, known]), rows.shape[2] - 1))
+        whole, _ = triangularise(jnp.concatenate([earlier, known]), d, full=d)
+        theta, root = moments(whole[-p:, -p - 1 :])
         return theta, covariance_of(root)
 
     return _backward(rows, motion, before, look)
@@ -241,7 +269,8 @@ def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, 
         # Before a jump by delta, the state was less by it.
         jump = jnp.concatenate([-earlier[:, -p - 1 : -1], jnp.zeros_like(known[:, -p - 1 : -1])])
         both = jnp.concatenate([earlier, known])
-        left = triangularise(jnp.concatenate([both[:, :-1], jump, both[:, -1:]], axis=1), d)[1]
+        both = jnp.concatenate([both[:, :-1], jump, both[:, -1:]], axis=1)
+        _, left = triangularise(both, d, full=d)
         return Shocks((left[:, :p] * left[:, p:]).sum(axis=0), (left[:, :p] ** 2).sum(axis=0))
 
     return _backward(rows, motion, before, look)
