@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -48,21 +49,26 @@ class Model:
     which: NDArray[np.int64]
     """(J, L) the parameter."""
 
+    decay: Numbers
+    """(L,) inverse of the time in which slopes die away [1/points of the grid]; zero where they last."""
+
     def __getitem__(self, lanes: NDArray[np.int64]) -> Model:
-        return Model(self.rate[:, lanes], self.at[:, lanes], self.which[:, lanes])
+        return Model(self.rate[:, lanes], self.at[:, lanes], self.which[:, lanes], self.decay[lanes])
 
     def motion(self, information: Numbers, order: int) -> Motion:
-        """The same in steps, see `step_of`. Slopes may begin with what they become within a memory."""
+        """The same in steps, see `step_of`. Slopes may begin with what they become within a memory, or in the end."""
         step = step_of(self.rate, information[:, None], order)
         walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
         memory = 1 / np.where(self.rate > 0, self.rate, 1)  # where a parameter stays its slopes do not matter
-        walk, slope, memory, at, which = map(jnp.asarray, (walk, slope, memory, self.at, self.which))
-        return Motion(walk, slope, memory, at, which, order)
+        left = np.exp(-self.decay + 0 * step)
+        begins = 1 / np.maximum(1 / memory, 1 - left**2)
+        steps = Motion(walk, slope, begins, self.at, self.which, order, left if order else None)
+        return jax.tree.map(jnp.asarray, steps)
 
     def finer(self, every: int, inside: NDArray[np.int64]) -> Model:
         """On a grid with `every` points for one, jumps being at the points `inside` (J, L)."""
         at = np.where(self.at == NONE, NONE, self.at * every + inside)
-        return Model(self.rate / every, at, self.which)
+        return Model(self.rate / every, at, self.which, self.decay / every)
 
 
 def step_of(rate: Numbers, information: Numbers, order: int) -> Numbers:
@@ -137,6 +143,8 @@ class Search:
     """How often a random walk is integrated until it is a parameter."""
     choices: tuple[Numbers, ...]
     """Of each parameter the rates that are tried: the first is zero, but where the rate is given."""
+    decays: Numbers
+    """What is tried for `Model.decay`: the first is zero."""
     jumping: bool
     found: dict[tuple[object, ...], Numbers] = field(default_factory=dict, compare=False, repr=False)
     """What was asked for already: by turns the same models come up again."""
@@ -163,7 +171,7 @@ class Search:
     def at_rest(self) -> Model:
         """The model that moves least."""
         none = np.full((MOST_JUMPS, 1), NONE)
-        return Model(np.array([some[:1] for some in self.choices]), none, np.zeros_like(none))
+        return Model(np.array([some[:1] for some in self.choices]), none, np.zeros_like(none), self.decays[:1])
 
     def log_likelihood(self, models: Model) -> tuple[Numbers, Numbers]:
         """(L,) of each model, and the square of the noise's scale."""
@@ -187,17 +195,24 @@ class Search:
 
     def of_rate(self, model: Model, i: int) -> Numbers:
         """(K,) logarithm of the probability of every choice for parameter i, all else as in the model."""
-        some = self.choices[i]
-        models = model[np.zeros(len(some), int)]
-        models.rate[i] = some
-        key = (i, *(x.tobytes() for x in (models.rate, model.at, model.which)))
+        rate = np.repeat(model.rate, len(self.choices[i]), axis=1)
+        rate[i] = self.choices[i]
+        return self._once(i, replace(model[np.zeros(len(rate[i]), int)], rate=rate)) + self.log_prior(i)
+
+    def of_decay(self, model: Model) -> Numbers:
+        """(K,) logarithm of the probability of every choice for the decay of slopes, each as probable beforehand."""
+        return self._once(-1, replace(model[np.zeros(len(self.decays), int)], decay=self.decays))
+
+    def _once(self, what: int, models: Model) -> Numbers:
+        """Logarithm of their likelihood, computed once."""
+        key = (what, *(x.tobytes() for x in vars(models).values()))
         if key not in self.found:
-            self.found[key] = self.log_likelihood(models)[0] + self.log_prior(i)
+            self.found[key] = self.log_likelihood(models)[0]
         return self.found[key]
 
     def of_jump(self, model: Model) -> Numbers:
         """(1 + p G,) logarithm of the probability of no further jump, and of one of each parameter at each point."""
-        key = tuple(x.tobytes() for x in (model.rate, model.at, model.which))
+        key = tuple(x.tobytes() for x in vars(model).values())
         if key not in self.found:
             odds = np.asarray(_log_odds(self.blocks, model.motion(self.information, self.order)))
             odds = np.where(self.moving, odds + self.log_jump, -np.inf)
@@ -225,7 +240,9 @@ class Search:
                 rate = model.rate.copy()
                 rate[i] = self.choices[i][np.argmax(self.of_rate(model, i))]
                 model = replace(model, rate=rate)
-            if (before.rate == model.rate).all():
+            if len(self.decays) > 1:
+                model = replace(model, decay=self.decays[[np.argmax(self.of_decay(model))]])
+            if (before.rate == model.rate).all() and (before.decay == model.decay).all():
                 break
         return model
 
@@ -273,6 +290,11 @@ class Search:
                 between = 2 ** (random.uniform(-0.5, 0.5, DRAWN) / PER_OCTAVE)
                 models.rate[i] = some[k] * between
                 log_weight += log_prior[k] - log_p[k]
+        if len(self.decays) > 1:
+            log_p = _normalised(self.of_decay(model))
+            k = _evenly(log_p, random)
+            models = replace(models, decay=self.decays[k])
+            log_weight += -np.log(len(log_p)) - log_p[k]
         taken = np.flatnonzero(model.at[:, 0] != NONE)
         free = np.setdiff1d(np.arange(MOST_JUMPS), taken)[: int(self.jumping and self.moving.any())]
         for j in (*taken.tolist(), *free.tolist()):
@@ -298,3 +320,8 @@ def rates(points: int) -> Numbers:
     """(K,) that are tried: zero, and those of all lengths up to the record."""
     octaves = np.log2(max(points / SHORTEST, 2.0))
     return np.append(0.0, 2.0 ** (np.arange(int(octaves * PER_OCTAVE) + 1) / PER_OCTAVE) / points)
+
+
+def decays(points: int, order: int) -> Numbers:
+    """(K,) that are tried: zero, and where there are slopes one in each octave."""
+    return rates(points)[:1] if order == 0 else np.append(0.0, rates(points)[1::PER_OCTAVE])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaximp.numerics.compilation import compiled
 from jaximp.tracking.blocks import Blocks, Scales, merged
 from jaximp.tracking.causal import filtered
-from jaximp.tracking.drift import NONE, Drawn, Search, rate_of, rates, step_of
+from jaximp.tracking.drift import NONE, Drawn, Search, decays, rate_of, rates, step_of
 from jaximp.tracking.state_space import (
     Motion,
     forward,
@@ -70,7 +70,7 @@ def find(fine: Blocks, by: Scales, sizes: Numbers, jumps: bool, apart: float, se
     coarse, unit = _merged(fine, every), apart ** (order + 0.5) / np.asarray(by.theta)
     given, tried = rate_of(sizes * unit, information, order) * every, rates(len(coarse.rows))
     choices = tuple(tried if np.isnan(rate) else np.array([rate]) for rate in given)
-    search = Search(coarse, information * every, order, choices, jumps)
+    search = Search(coarse, information * every, order, choices, decays(len(coarse.rows), order), jumps)
     return Found(search, search.drawn(seed), every, unit)
 
 

@@ -27,8 +27,10 @@ from jaximp.tracking.results import Drift, Path, Track
 from jaximp.tracking.state_space import Motion, forward, smoother
 from jaximp.types import AnyArray, Numbers
 
-ORDERS, KINDS = (0, 1, 2), (0, 1)
-"""How often a random walk may be integrated, and the kinds of motion that are weighed against each other."""
+ORDERS = (0, 1, 2)
+"""How often a random walk may be integrated."""
+FEW = 5
+"""For more parameters than these, smooth motion is a random walk integrated once and not twice, which costs less."""
 ROUNDS, SETTLED = 5, 1e-3
 """How often paths are followed where drift sizes are given, until the noise is as large as it was taken to be."""
 TOGETHER = 128
@@ -61,8 +63,9 @@ def track(
     taken as white.
 
     Drift sizes come from the likelihood, unless `drift` (p,) gives them, as in `Drift.size`: zero for a parameter that
-    stays where it is, NaN for one to be estimated. Parameters do a random walk, or their slopes do: what the likelihood
-    makes of it, unless `order` says how often a random walk is integrated (0, 1 or 2). With `jumps=False` no parameter
+    stays where it is, NaN for one to be estimated. Parameters do a random walk, or move smoothly, with slopes that die
+    away, sooner or later: what the likelihood makes of it, unless `order` says how often a random walk is integrated
+    (0, 1 or 2). With `jumps=False` no parameter
     jumps. `seed` draws the models that are averaged, and the same seed the same ones.
 
     **Returns:** a `Track`. Its bands hold what is not known of drift sizes, of the kind of motion, and of times of
@@ -89,7 +92,7 @@ def track(
         raise ValueError(f"drift has shape {sizes.shape}: give {p} numbers from zero up, NaN for what is to be found")
     if order not in (None, *ORDERS):
         raise ValueError(f"order is {order}: give 0, 1 or 2, how often a random walk is integrated, or None")
-    named, kinds = _named(p, names, units), KINDS if order is None else (order,)
+    named, kinds = _named(p, names, units), ((0, 2) if p <= FEW else (0, 1)) if order is None else (order,)
     look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, seed=seed)
     by, fine, found = _found(blocks, sizes, lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
     time = _middles(len(blocks.rows), step, every, len(given[1])) / rate

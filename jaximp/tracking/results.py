@@ -98,7 +98,8 @@ class Track(eqx.Module, Result):
     """Probability that a parameter jumped in front of this point."""
     drift: Drift
     smooth: float
-    """Probability that parameters move smoothly: that their slopes do a random walk, and not they themselves."""
+    """Probability that parameters move smoothly: that what does a random walk is not they themselves, but their slopes
+    or the slopes' slopes."""
     noise: float
     """Standard deviation of the noise in a white row [N m]; in units of each output's own, where there are several."""
     log_likelihood: float

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Int
 
 from jaximp.numerics.compilation import keep
 from jaximp.numerics.lanes import divided, sum_of
+from jaximp.types import AnyArray
 
 T = TypeVar("T")
 
@@ -42,19 +43,21 @@ NOTHING = 1e-6
 class Motion(eqx.Module):
     """How the parameters of L models move."""
 
-    walk: Float[Array, "p L"]
+    walk: Float[AnyArray, "p L"]
     """Variance of a parameter's own random step."""
-    slope: Float[Array, "p L"]
+    slope: Float[AnyArray, "p L"]
     """How far a parameter moves in a step for a slope of one. Zero: it stays where it is."""
-    memory: Float[Array, "p L"]
+    memory: Float[AnyArray, "p L"]
     """Points of the grid in which slopes become what they may be before the record."""
-    at: Int[Array, "J L"]
+    at: Int[AnyArray, "J L"]
     """Point of the grid in front of which a jump is; -1 for none."""
-    which: Int[Array, "J L"]
+    which: Int[AnyArray, "J L"]
     """Parameter that jumps."""
     order: int = eqx.field(static=True)
     """How many times a random walk, of variance one, is integrated until it is a parameter; without any, parameters do
     a random walk themselves."""
+    left: Float[AnyArray, "p L"] | None = None
+    """What is left of slopes, and of what they are integrals of, after a step. None: all of it."""
 
     def jump_variance(self, k: Array) -> Float[Array, "p L"]:
         """Of the jumps in front of point k: they are of the size of the parameter, one."""
@@ -157,8 +160,8 @@ def start(motion: Motion) -> Float[Array, "d e L"]:
 
 def moved(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Array]:
     """What is known after a step, and twice the logarithm of what it takes off the determinant."""
-    known = _stepped(known, motion, -1.0)
-    return _less_certain(known, motion, jumps)
+    known, less = _less_certain(_stepped(known, motion, -1.0), motion, jumps)
+    return known, less if motion.left is None else less - 2 * motion.order * jnp.log(motion.left).sum(axis=0)
 
 
 def _stepped(known: Array, motion: Motion, sign: float) -> Array:
@@ -168,9 +171,10 @@ def _stepped(known: Array, motion: Motion, sign: float) -> Array:
     """
     p, order = len(motion.walk), motion.order
     parts = [known[:, k * p : (k + 1) * p] for k in range(order + 1)]
+    left = jnp.ones_like(motion.slope) if motion.left is None else motion.left
     for k in range(order) if sign > 0 else reversed(range(order)):
-        share = motion.slope if k == order - 1 else jnp.ones_like(motion.slope)
-        parts[k] = parts[k] + sign * share * parts[k + 1]
+        taken = (motion.slope if k == order - 1 else jnp.ones_like(motion.slope)) * parts[k + 1]
+        parts[k] = left * parts[k] + taken if sign > 0 else (parts[k] - taken) / left
     return jnp.concatenate([*parts, known[:, -1:]], axis=1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,12 +47,15 @@ class Dense(NamedTuple):
         return float(multivariate_normal.logpdf(y, np.zeros(len(y)), B @ B.T + np.eye(len(y))))
 
 
-def dense(W: Numbers, walk: Numbers, slope: Numbers, jumps: list[tuple[int, int]], order: int = 0) -> Dense:
+def dense(
+    W: Numbers, walk: Numbers, slope: Numbers, jumps: list[tuple[int, int]], order: int = 0, left: float = 1.0
+) -> Dense:
     """Every random number is followed through the record."""
     p, d = P, (order + 1) * P
     F, variance = np.eye(d), np.zeros((POINTS + 1, d))
     variance[0, d - p :], variance[1:, d - p :] = PRIOR**2, walk
     if order:
+        F[: d - p, : d - p] *= left
         F[d - p :, d - 2 * p : d - p] = np.diag(slope)
         F[p : d - p, : d - 2 * p] += np.eye(d - 2 * p)
         variance[0, : d - p] = np.repeat(MEMORY ** (2 * np.arange(order) + 1), p)
@@ -73,7 +76,7 @@ def dense(W: Numbers, walk: Numbers, slope: Numbers, jumps: list[tuple[int, int]
 
 
 NONE = np.zeros(2)
-KINDS: dict[str, tuple[Numbers, Numbers, list[tuple[int, int]], int]] = {
+KINDS: dict[str, tuple[Any, ...]] = {
     "walk": (np.array([0.3, 0.01]), NONE, [], 0),
     "one stays": (np.array([0.3, 0.0]), NONE, [], 0),
     "all stay": (NONE, NONE, [], 0),
@@ -81,6 +84,8 @@ KINDS: dict[str, tuple[Numbers, Numbers, list[tuple[int, int]], int]] = {
     "smooth": (NONE, np.array([0.2, 0.01]), [], 1),
     "smooth with a jump": (NONE, np.array([0.2, 0.0]), [(5, 0)], 1),
     "smoother": (NONE, np.array([0.02, 0.001]), [(7, 1)], 2),
+    "slopes die away": (NONE, np.array([0.2, 0.01]), [], 1, 0.7),
+    "smoother, and slopes die away": (NONE, np.array([0.2, 0.0]), [(5, 1)], 2, 0.8),
 }
 
 
@@ -94,13 +99,16 @@ def rows(kind: str, each: int = 3) -> tuple[Numbers, Numbers]:
     return W, y
 
 
-def motion(walk: Numbers, slope: Numbers, jumps: list[tuple[int, int]], order: int = 0) -> Motion:
+def motion(
+    walk: Numbers, slope: Numbers, jumps: list[tuple[int, int]], order: int = 0, left: float | None = None
+) -> Motion:
     """Of two lanes: this model, and another one that must not disturb it."""
     at, which = np.full((3, 2), -1), np.zeros((3, 2), int)
     for j, (k, i) in enumerate(jumps):
         at[j, 0], which[j, 0] = k, i
     both = (jnp.asarray(np.stack([x, x + 1], axis=1)) for x in (walk, slope))
-    return Motion(*both, jnp.full((2, 2), MEMORY), jnp.asarray(at), jnp.asarray(which), order)
+    fading = None if left is None else jnp.full((2, 2), left)
+    return Motion(*both, jnp.full((2, 2), MEMORY), jnp.asarray(at), jnp.asarray(which), order, fading)
 
 
 @jax.jit
@@ -144,13 +152,13 @@ def test_the_filter_knows_what_came_before(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_odds_of_a_jump_are_ratios_of_likelihoods(kind: str) -> None:
     W, y = rows("plain")
-    walk, slope, jumps, order = KINDS[kind]
+    walk, slope, jumps, *kind_of_motion = KINDS[kind]
     blocks, moving = compress(W, y, np.ones(len(y)), 3), motion(*KINDS[kind])
     odds = passes(blocks.rows, moving)[-1]
     without = dense(W, *KINDS[kind]).log_likelihood(y)
     for k in range(1, POINTS):
         for i in range(P):
-            wanted = dense(W, walk, slope, [*jumps, (k, i)], order).log_likelihood(y) - without
+            wanted = dense(W, walk, slope, [*jumps, (k, i)], *kind_of_motion).log_likelihood(y) - without
             np.testing.assert_allclose(odds[k, i, 0], wanted, rtol=1e-6, atol=1e-8)
 
 

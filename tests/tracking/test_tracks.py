@@ -182,7 +182,7 @@ def test_kind_and_drift_are_found() -> None:
     assert sine.smooth > 0.99 > 0.9 > step.smooth
     assert sine.drift.moves[0] > 0.99 > 0.5 > sine.drift.moves[1]
     assert sine.log_likelihood > followed(*record("sine"), order=0).log_likelihood
-    size, spread = sine.drift.mean(order=1), sine.drift.stderr(order=1)
+    size, spread = sine.drift.mean(order=2), sine.drift.stderr(order=2)
     assert 0.05 < spread[0] / size[0] < 0.5
 
 
