@@ -160,12 +160,12 @@ class Recursive:
 
 
 def _recursive(recordings: tuple[Recording, Recording], offset: bool, forgetting: float) -> Recursive:
-    W, torque, valid, time = _human_rows(recordings, offset)
+    W, torque, valid, time = human_rows(recordings, offset)
     fit = recursive_least_squares(W, torque, forgetting, valid=jnp.asarray(valid))
     return Recursive(forgetting, time, np.asarray(fit.theta))
 
 
-def _human_rows(recordings: tuple[Recording, Recording], offset: bool) -> tuple[Numbers, Numbers, Any, Numbers]:
+def human_rows(recordings: tuple[Recording, Recording], offset: bool) -> tuple[Numbers, Numbers, Any, Numbers]:
     """Rows of the human's model and its torque by method 1, filtered once, at every sample."""
     alone, held = recordings
     pipeline = _pipeline(offset, 2.0, mode="once")
@@ -181,7 +181,7 @@ def _causal_torque(
     recordings: tuple[Recording, Recording], source: Estimates | Recursive, offset: bool
 ) -> tuple[Numbers, Numbers, Numbers, float]:
     """Time, the human's torque, its reconstruction from parameters known at each sample, and the VAF [%]."""
-    W, torque, valid, time = _human_rows(recordings, offset)
+    W, torque, valid, time = human_rows(recordings, offset)
     if isinstance(source, Recursive):
         theta = source.theta
     else:
