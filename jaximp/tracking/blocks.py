@@ -26,16 +26,15 @@ class Blocks(eqx.Module):
     """Rows of a record, compressed to the G points of a grid."""
 
     rows: Float[Array, "G r f"]
-    """Regressor and torque, side by side; as many rows as parameters, or fewer."""
+    """Regressor and torque, side by side; as many rows as parameters, or fewer. Columns of curves come first."""
     left: Float[Array, ""]
     """Squares of the torque that no parameters can explain that stay the same inside of a block."""
     count: Float[Array, ""]
     """Rows that count."""
 
-    @property
-    def freedom(self) -> Array:
+    def freedom(self, p: int) -> Array:
         """Rows less parameters."""
-        return jnp.maximum(self.count - (self.rows.shape[-1] - 1), 1.0)
+        return jnp.maximum(self.count - p, 1.0)
 
 
 class Scales(eqx.Module):
@@ -98,7 +97,12 @@ def scales(blocks: Blocks) -> Scales:
     return Scales(noise, scale * noise / length, scale**2 / variance / points)
 
 
-def scaled(blocks: Blocks, by: Scales) -> Blocks:
-    """In these scales."""
-    factor = jnp.append(by.theta, 1.0) / by.noise
+def without_curves(blocks: Blocks, p: int) -> Blocks:
+    """The same with the columns of p parameters alone."""
+    return eqx.tree_at(lambda b: b.rows, blocks, blocks.rows[..., -p - 1 :])
+
+
+def scaled(blocks: Blocks, by: Scales, owners: tuple[int, ...] = ()) -> Blocks:
+    """In these scales; the first columns are of curves of the parameters `owners`."""
+    factor = jnp.concatenate([by.theta[jnp.array(owners, int)], by.theta, jnp.ones(1)]) / by.noise
     return Blocks(blocks.rows * factor, blocks.left / by.noise**2, blocks.count)

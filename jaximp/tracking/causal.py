@@ -10,7 +10,7 @@ with applications to tracking and navigation, 2001, chapter 11.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,8 @@ from jaximp.tracking.state_space import (
     Motion,
     covariance_of,
     log_volume,
-    moments,
     moved,
+    seen,
     start,
     widened,
     with_rows,
@@ -39,34 +39,40 @@ class _Bank(NamedTuple):
 
 
 def filtered(
-    rows: Float[Array, "G r f"], motion: Motion, scale: Array, log_jump: Array, moving: Array, every: int
+    rows: Float[Array, "G r f"],
+    motion: Motion,
+    scale: Array,
+    log_jump: Array,
+    moving: Array,
+    every: int,
+    curves: Float[Array, "G p c"] | None = None,
 ) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
     """Mean and covariance at each point.
 
     **Arguments:** `motion` of L models, whose jumps are left out of account; `scale` (L,) square of the noise's;
     `log_jump` logarithm of the probability that a parameter jumps within `every` points, which lie between two splits,
-    and `moving` (p,) which may: without any a single filter runs for each model."""
-    points, p = len(rows), rows.shape[-1] - 1
+    and `moving` (p,) which may: without any a single filter runs for each model; `curves` of `state_space.seen`."""
+    points, p, f = len(rows), len(motion.walk), rows.shape[-1] - 1
     bank = max(BANK, 2 * p) if len(moving) else 1
     wide = jax.tree.map(lambda x: x[:, None], motion)
     known = start(motion)
     known = jnp.broadcast_to(known[:, :, None], (*known.shape[:2], bank, known.shape[2]))
     one = jnp.where(jnp.arange(bank) == 0, 0.0, -1e6)[:, None] + jnp.zeros_like(scale)
 
-    def step(at: _Bank, now: tuple[Array, Array]) -> tuple[_Bank, tuple[Array, Array]]:
-        k, block = now
+    def step(at: _Bank, now: tuple[Array, Array, Any]) -> tuple[_Bank, tuple[Array, Array]]:
+        k, block, curve = now
         before, less = moved(at.known, wide, jnp.zeros_like(wide.walk))
         at = at._replace(known=before, evidence=at.evidence + less / 2)
         if len(moving):
             at = jax.lax.cond(k % every == 0, lambda at: _split(at, moving, log_jump), lambda at: at, at)
-        known, left = with_rows(at.known, block)
+        known, left = with_rows(at.known, wide.of_lanes(block))
         evidence = at.evidence - left / (2 * scale)
         log_weight = evidence - log_volume(known)
-        theta, root = moments(known[-p:, -p - 1 :])
+        theta, root = seen(known[-f:, -f - 1 :], wide, curve)
         weight = jax.nn.softmax(log_weight, axis=0)
         return _Bank(known, evidence, log_weight), _mixed(theta, covariance_of(root) * scale, weight)
 
-    return jax.lax.scan(step, _Bank(known, one, one), (jnp.arange(points), rows))[1]
+    return jax.lax.scan(step, _Bank(known, one, one), (jnp.arange(points), rows, curves))[1]
 
 
 def _mixed(

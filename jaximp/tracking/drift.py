@@ -3,14 +3,16 @@
 A parameter that does not move is known from the whole record; one that moves is known from a stretch around each
 instant, the longer the slower it moves. The length of this stretch, its memory, tells how fast it moves in a way that
 depends on no unit. All lengths are tried, from a few points of the grid to the whole record, and none (the parameter
-stays where it is); jumps are added where the likelihood of one at any point demands it. Around the best model others
-are drawn, and weighted by their likelihood: what is not known of the drift is in the bands.
+stays where it is); of smooth motion also all times in which slopes die away, and of parameters that depend on what is
+measured how far their curves wander. Jumps are added where the likelihood of one at any point demands it. Around the
+best model others are drawn, and weighted by their likelihood: what is not known of the drift is in the bands.
 
 **Source:** collapsed sampling of jumps: Gerlach, Carter and Kohn 2000; importance resampling: Rubin 1987.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -28,6 +30,8 @@ SHORTEST, PER_OCTAVE = 4.0, 2
 """Shortest memory, in points of the grid, and how many lengths are tried of which one is twice as long as the other."""
 STAYS = 0.5
 """Probability, before anything is measured, that a parameter stays where it is."""
+SPREADS = np.append(0.0, 2.0 ** np.arange(-7.0, 1.5, 0.5))
+"""What is tried for how far a curve wanders from one of its coefficients to the next, in the parameter's scale."""
 JUMPS = 1.0
 """How many jumps a record is expected to have, of all parameters together, before anything is measured."""
 MOST_JUMPS = 16
@@ -51,24 +55,27 @@ class Model:
 
     decay: Numbers
     """(L,) inverse of the time in which slopes die away [1/points of the grid]; zero where they last."""
+    spread: Numbers
+    """(V, L) how far each of V curves wanders from one coefficient to the next."""
 
     def __getitem__(self, lanes: NDArray[np.int64]) -> Model:
-        return Model(self.rate[:, lanes], self.at[:, lanes], self.which[:, lanes], self.decay[lanes])
+        return Model(*(x[..., lanes] for x in vars(self).values()))
 
-    def motion(self, information: Numbers, order: int) -> Motion:
+    def motion(self, information: Numbers, order: int, coefficients: Sequence[int] = ()) -> Motion:
         """The same in steps, see `step_of`. Slopes may begin with what they become within a memory, or in the end."""
         step = step_of(self.rate, information[:, None], order)
         walk, slope = (step**2, 0 * step) if order == 0 else (0 * step, step)
         memory = 1 / np.where(self.rate > 0, self.rate, 1)  # where a parameter stays its slopes do not matter
         left = np.exp(-self.decay + 0 * step)
         begins = 1 / np.maximum(1 / memory, 1 - left**2)
-        steps = Motion(walk, slope, begins, self.at, self.which, order, left if order else None)
+        spread = np.repeat(self.spread, coefficients, axis=0) if coefficients else None
+        steps = Motion(walk, slope, begins, self.at, self.which, order, left if order else None, spread)
         return jax.tree.map(jnp.asarray, steps)
 
     def finer(self, every: int, inside: NDArray[np.int64]) -> Model:
         """On a grid with `every` points for one, jumps being at the points `inside` (J, L)."""
         at = np.where(self.at == NONE, NONE, self.at * every + inside)
-        return Model(self.rate / every, at, self.which, self.decay / every)
+        return replace(self, rate=self.rate / every, at=at, decay=self.decay / every)
 
 
 def step_of(rate: Numbers, information: Numbers, order: int) -> Numbers:
@@ -97,7 +104,7 @@ _evidence = compiled(evidence)
 def _log_odds(blocks: Blocks, motion: Motion) -> Array:
     """(G, p) of a jump in front of each point, for the first of the models; see `Shocks`."""
     found, before = forward(blocks.rows, motion)
-    scale = (found.squares + blocks.left) / blocks.freedom
+    scale = (found.squares + blocks.left) / blocks.freedom(len(motion.walk))
     return shocks(blocks.rows, motion, before).log_odds(scale)[..., 0]
 
 
@@ -145,6 +152,8 @@ class Search:
     """Of each parameter the rates that are tried: the first is zero, but where the rate is given."""
     decays: Numbers
     """What is tried for `Model.decay`: the first is zero."""
+    coefficients: tuple[int, ...]
+    """How many each of the curves has."""
     jumping: bool
     found: dict[tuple[object, ...], Numbers] = field(default_factory=dict, compare=False, repr=False)
     """What was asked for already: by turns the same models come up again."""
@@ -171,19 +180,24 @@ class Search:
     def at_rest(self) -> Model:
         """The model that moves least."""
         none = np.full((MOST_JUMPS, 1), NONE)
-        return Model(np.array([some[:1] for some in self.choices]), none, np.zeros_like(none), self.decays[:1])
+        rate, spread = np.array([some[:1] for some in self.choices]), np.zeros((len(self.coefficients), 1))
+        return Model(rate, none, np.zeros_like(none), self.decays[:1], spread)
+
+    def motion(self, models: Model) -> Motion:
+        """Of models of this record."""
+        return models.motion(self.information, self.order, self.coefficients)
 
     def log_likelihood(self, models: Model) -> tuple[Numbers, Numbers]:
         """(L,) of each model, and the square of the noise's scale."""
         lanes, found = models.rate.shape[1], []
         for first in range(0, lanes, LANES):
             some = np.minimum(np.arange(first, first + LANES), lanes - 1)
-            found.append(_evidence(self.blocks.rows, models[some].motion(self.information, self.order)))
+            found.append(_evidence(self.blocks.rows, self.motion(models[some])))
         squares, determinant = (
             np.concatenate([np.asarray(getattr(one, name)) for one in found])[:lanes]
             for name in ("squares", "log_determinant")
         )
-        left, freedom = float(self.blocks.left), float(self.blocks.freedom)
+        left, freedom = float(self.blocks.left), float(self.blocks.freedom(len(self.choices)))
         scale = (squares + left) / freedom
         return determinant - freedom / 2 * np.log(scale), scale
 
@@ -203,6 +217,13 @@ class Search:
         """(K,) logarithm of the probability of every choice for the decay of slopes, each as probable beforehand."""
         return self._once(-1, replace(model[np.zeros(len(self.decays), int)], decay=self.decays))
 
+    def of_spread(self, model: Model, v: int) -> Numbers:
+        """(K,) logarithm of the probability of every choice of how far curve v wanders."""
+        spread = np.repeat(model.spread, len(SPREADS), axis=1)
+        spread[v] = SPREADS
+        found = self._once(-2 - v, replace(model[np.zeros(len(SPREADS), int)], spread=spread))
+        return found + np.log(np.append(STAYS, np.full(len(SPREADS) - 1, (1 - STAYS) / (len(SPREADS) - 1))))
+
     def _once(self, what: int, models: Model) -> Numbers:
         """Logarithm of their likelihood, computed once."""
         key = (what, *(x.tobytes() for x in vars(models).values()))
@@ -214,7 +235,7 @@ class Search:
         """(1 + p G,) logarithm of the probability of no further jump, and of one of each parameter at each point."""
         key = tuple(x.tobytes() for x in vars(model).values())
         if key not in self.found:
-            odds = np.asarray(_log_odds(self.blocks, model.motion(self.information, self.order)))
+            odds = np.asarray(_log_odds(self.blocks, self.motion(model)))
             odds = np.where(self.moving, odds + self.log_jump, -np.inf)
             odds[0] = -np.inf
             self.found[key] = np.append(0.0, odds.T.ravel())
@@ -236,13 +257,17 @@ class Search:
         moving = np.flatnonzero([len(some) > 1 for some in self.choices])
         for _ in range(rounds):
             before = model
+            for v in range(len(self.coefficients)):
+                spread = model.spread.copy()
+                spread[v] = SPREADS[np.argmax(self.of_spread(model, v))]
+                model = replace(model, spread=spread)
             for i in moving.tolist():
                 rate = model.rate.copy()
                 rate[i] = self.choices[i][np.argmax(self.of_rate(model, i))]
                 model = replace(model, rate=rate)
             if len(self.decays) > 1:
                 model = replace(model, decay=self.decays[[np.argmax(self.of_decay(model))]])
-            if (before.rate == model.rate).all() and (before.decay == model.decay).all():
+            if all((a == b).all() for a, b in zip(vars(before).values(), vars(model).values(), strict=True)):
                 break
         return model
 
@@ -295,6 +320,11 @@ class Search:
             k = _evenly(log_p, random)
             models = replace(models, decay=self.decays[k])
             log_weight += -np.log(len(log_p)) - log_p[k]
+        for v in range(len(self.coefficients)):
+            log_p = self.of_spread(model, v)
+            k = _evenly(_normalised(log_p), random)
+            models.spread[v] = SPREADS[k] * 2 ** random.uniform(-0.25, 0.25, DRAWN)
+            log_weight += np.log(np.where(k == 0, STAYS, (1 - STAYS) / (len(SPREADS) - 1))) - _normalised(log_p)[k]
         taken = np.flatnonzero(model.at[:, 0] != NONE)
         free = np.setdiff1d(np.arange(MOST_JUMPS), taken)[: int(self.jumping and self.moving.any())]
         for j in (*taken.tolist(), *free.tolist()):

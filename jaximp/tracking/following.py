@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,6 +23,7 @@ from jaximp.tracking.state_space import (
     smoother,
     solved,
     triangularise,
+    with_rows,
 )
 from jaximp.types import AnyArray, Numbers
 
@@ -38,6 +40,13 @@ class Moments(eqx.Module):
     covariance: Float[AnyArray, "G p p"]
 
 
+class Shapes(eqx.Module):
+    """What parameters have of the steps of curves: see `Curves`."""
+
+    points: Float[AnyArray, "G p c"] | None
+    shown: Float[AnyArray, "Q f"]
+
+
 class Followed(eqx.Module):
     """The models of one kind, in scales of the record."""
 
@@ -49,6 +58,8 @@ class Followed(eqx.Module):
     """(L, p) as `Drift.size`."""
     innovations: AnyArray
     """(G, r) of the most probable model."""
+    curves: Moments
+    """At the end of the record, see `Curves.shown`: (Q,) and (Q, 1, 1)."""
 
 
 @dataclass(frozen=True)
@@ -63,32 +74,42 @@ class Found:
     """(p,) what a size of one (`Drift.size`) does in a step of the fine grid, in the scales of the record."""
 
 
-def find(fine: Blocks, by: Scales, sizes: Numbers, jumps: bool, apart: float, seed: int, order: int) -> Found:
+def find(
+    fine: Blocks,
+    by: Scales,
+    sizes: Numbers,
+    jumps: bool,
+    apart: float,
+    coefficients: tuple[int, ...],
+    seed: int,
+    order: int,
+) -> Found:
     """**Arguments:** `fine` scaled blocks; `sizes` (p,) as `Drift.size`, NaN where they are to be found; `apart` time
-    between two points [s]."""
+    between two points [s]; `coefficients` of each curve."""
     every, information = -(-len(fine.rows) // SEARCHED), np.asarray(by.information)
     coarse, unit = _merged(fine, every), apart ** (order + 0.5) / np.asarray(by.theta)
     given, tried = rate_of(sizes * unit, information, order) * every, rates(len(coarse.rows))
     choices = tuple(tried if np.isnan(rate) else np.array([rate]) for rate in given)
-    search = Search(coarse, information * every, order, choices, decays(len(coarse.rows), order), jumps)
+    slopes = decays(len(coarse.rows), order)
+    search = Search(coarse, information * every, order, choices, slopes, coefficients, jumps)
     return Found(search, search.drawn(seed), every, unit)
 
 
-def follow(fine: Blocks, found: Found, seed: int) -> Followed:
+def follow(fine: Blocks, found: Found, shapes: Shapes, seed: int) -> Followed:
     """Their paths on the fine grid."""
     search, drawn, every = found.search, found.drawn, found.every
     inside = np.random.default_rng(seed).integers(0, every, drawn.models.at.shape)
     models, information = drawn.models.finer(every, inside), search.information / every
 
     def motion(lanes: NDArray[np.int64]) -> tuple[Motion, Array]:
-        return models[lanes].motion(information, search.order), jnp.asarray(drawn.scale[lanes])
+        return models[lanes].motion(information, search.order, search.coefficients), jnp.asarray(drawn.scale[lanes])
 
     shown, moving = drawn.some(SHOWN), search.moving & search.jumping
     best = jnp.asarray(np.argmax(drawn.log_weight[shown]))
-    theta, covariance, innovations = _path(fine.rows, *motion(shown), best)
+    theta, covariance, innovations, *at_end = _path(fine.rows, *motion(shown), best, shapes)
     causal = _filtered(
         fine.rows, *motion(drawn.some(CAUSAL)), jnp.asarray(search.log_jump),
-        jnp.asarray(moving if moving.any() else moving[:0]), every=every,
+        jnp.asarray(moving if moving.any() else moving[:0]), every=every, curves=shapes.points,
     )  # fmt: skip
     step = step_of(models.rate[:, shown], information[:, None], search.order) * np.sqrt(drawn.scale[shown])
     jumped = np.repeat(_jump_probability(drawn, search.points), every, axis=0)[: len(fine.rows)] / every
@@ -98,6 +119,7 @@ def follow(fine: Blocks, found: Found, seed: int) -> Followed:
         jumped=jumped,
         size=step.T / found.unit,
         innovations=innovations,
+        curves=mixed(at_end[0][:, None], at_end[1][:, None, None], np.full(SHOWN, 1 / SHOWN)),
     )
 
 
@@ -119,19 +141,29 @@ def _jump_probability(drawn: Drawn, points: int) -> Numbers:
 
 @compiled
 def _path(
-    rows: Array, motion: Motion, scale: Array, best: Array
-) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"], Float[Array, "G r"]]:
-    """What each model makes of the whole record, and the innovations of the best one."""
+    rows: Array, motion: Motion, scale: Array, best: Array, shapes: Shapes
+) -> tuple[
+    Float[Array, "G p L"], Float[Array, "G p p L"], Float[Array, "G r"], Float[Array, "Q L"], Float[Array, "Q L"]
+]:
+    """What each model makes of the whole record, the innovations of the best one, and curves with their variance."""
     before = forward(rows, motion)[1]
-    theta, covariance = smoother(rows, motion, before)
-    innovations = _innovations(rows, jnp.moveaxis(before, 0, 2)[..., best]) / jnp.sqrt(scale[best])
-    return theta, covariance * scale, innovations
+    theta, covariance = smoother(rows, motion, before, shapes.points)
+    own, f = jax.tree.map(lambda x: x[:, best, None], motion), rows.shape[-1] - 1
+    innovations = _innovations(own.of_lanes(jnp.moveaxis(rows, 0, -1)), jnp.moveaxis(before, 0, 2)[..., best])
+    last, root = moments(with_rows(before[-1], motion.of_lanes(rows[-1]))[0][-f:, -f - 1 :])
+    unit = (
+        jnp.ones_like(last)
+        if motion.spread is None
+        else jnp.ones_like(last).at[: len(motion.spread)].set(motion.spread)
+    )
+    shown = jnp.einsum("qf,fl,fl->ql", shapes.shown, unit, last)
+    spread = jnp.einsum("qf,fl,fgl->qgl", shapes.shown, unit, root)
+    return theta, covariance * scale, innovations / jnp.sqrt(scale[best]), shown, (spread**2).sum(axis=1) * scale
 
 
-def _innovations(rows: Float[Array, "G r f"], before: Float[Array, "d e G"]) -> Float[Array, "G r"]:
+def _innovations(block: Float[Array, "r f G"], before: Float[Array, "d e G"]) -> Float[Array, "G r"]:
     """What each row of a block says that was not known before, standardised by what was expected of it."""
-    theta, root = moments(own_triangle(before, rows.shape[-1] - 1))
-    block = jnp.moveaxis(rows, 0, -1)
+    theta, root = moments(own_triangle(before, block.shape[1] - 1))
     regressor, r = block[:, :-1], len(block)
     surprise = block[:, -1] - (regressor * theta).sum(axis=1)
     spread = (regressor[:, :, None] * root).sum(axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -20,10 +20,11 @@ from jaximp.least_squares.window import check_finite
 from jaximp.numerics.compilation import compiled, require_numbers
 from jaximp.numerics.linear_algebra import root
 from jaximp.numerics.precision import require_float64
-from jaximp.tracking.blocks import Blocks, Scales, as_blocks, compress, scaled, scales
+from jaximp.tracking.blocks import Blocks, Scales, as_blocks, compress, scaled, scales, without_curves
+from jaximp.tracking.curves import Curves, curves_of
 from jaximp.tracking.drift import NONE
-from jaximp.tracking.following import Found, Moments, find, follow, mixed
-from jaximp.tracking.results import Drift, Path, Track
+from jaximp.tracking.following import Found, Moments, Shapes, find, follow, mixed
+from jaximp.tracking.results import Curve, Drift, Path, Track
 from jaximp.tracking.state_space import Motion, forward, smoother
 from jaximp.types import AnyArray, Numbers
 
@@ -50,6 +51,7 @@ def track(
     drift: Num[AnyArray, " p"] | None = None,
     order: int | None = None,
     jumps: bool = True,
+    varies_with: Mapping[str, AnyArray] | None = None,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
     seed: int = 0,
@@ -66,7 +68,9 @@ def track(
     stays where it is, NaN for one to be estimated. Parameters do a random walk, or move smoothly, with slopes that die
     away, sooner or later: what the likelihood makes of it, unless `order` says how often a random walk is integrated
     (0, 1 or 2). With `jumps=False` no parameter
-    jumps. `seed` draws the models that are averaged, and the same seed the same ones.
+    jumps. `varies_with` gives, by the name of a parameter (`theta_0` and so on without `names`), what it depends on in
+    each row (N,), such as a position: the parameter is then a smooth function of it, which may drift and jump besides.
+    `seed` draws the models that are averaged, and the same seed the same ones.
 
     **Returns:** a `Track`. Its bands hold what is not known of drift sizes, of the kind of motion, and of times of
     jumps. Where nothing moves that would tell a parameter, they are wide: before all measurements a parameter is taken
@@ -80,9 +84,12 @@ def track(
     """
     require_numbers("track", "give drift sizes to smoothed_path", W, y, valid, drift)
     require_float64(W, y)
-    given = _checked(W, y, valid, step := in_samples("grid", grid, sample_rate))
-    W, y, valid, every = _white(*given, noise)
-    step, p = max(1, step // every), W.shape[-1]
+    W, y, valid = _checked(W, y, valid, step := in_samples("grid", grid, sample_rate))
+    samples, p = len(y), W.shape[-1]
+    named, counts = _named(p, names, units), valid.any(axis=1)
+    curves = curves_of(dict(varies_with or {}), named[0], counts)
+    W, y, valid, every = _white(W if curves is None else curves.columns(W), y, valid, noise)
+    step = max(1, step // every)
     blocks = _compress(*_weighed(W, y, valid, step), step)
     if not float(blocks.count) > p:
         raise ValueError(f"{int(blocks.count)} rows count, for {p} parameters: give more rows")
@@ -92,11 +99,14 @@ def track(
         raise ValueError(f"drift has shape {sizes.shape}: give {p} numbers from zero up, NaN for what is to be found")
     if order not in (None, *ORDERS):
         raise ValueError(f"order is {order}: give 0, 1 or 2, how often a random walk is integrated, or None")
-    named, kinds = _named(p, names, units), ((0, 2) if p <= FEW else (0, 1)) if order is None else (order,)
-    look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, seed=seed)
-    by, fine, found = _found(blocks, sizes, lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
-    time = _middles(len(blocks.rows), step, every, len(given[1])) / rate
-    return _averaged(fine, by, found, time, named, sample_rate is not None, seed)
+    kinds = ((0, 2) if p <= FEW else (0, 1)) if order is None else (order,)
+    coefficients = () if curves is None else curves.coefficients
+    look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, coefficients=coefficients, seed=seed)
+    by, fine, found = _found(
+        blocks, sizes, () if curves is None else curves.owners, lambda *scaled: [look(*scaled, order=k) for k in kinds]
+    )
+    time = _middles(len(blocks.rows), step, every, samples) / rate
+    return _averaged(fine, by, found, curves, step * every, time, named, sample_rate is not None, seed)
 
 
 def smoothed_path(
@@ -172,13 +182,13 @@ def _side_by_side(
 
 
 def _found(
-    blocks: Blocks, sizes: Numbers, look: Callable[[Blocks, Scales], list[Found]]
+    blocks: Blocks, sizes: Numbers, owners: tuple[int, ...], look: Callable[[Blocks, Scales], list[Found]]
 ) -> tuple[Scales, Blocks, list[Found]]:
     """Models of all kinds, in scales of the record. Sizes that are given are no multiples of the noise: where there are
     any, this is repeated until the noise is as large as it was taken to be."""
-    by: Scales = _scales(blocks)
+    by: Scales = _scales(without_curves(blocks, len(sizes)))
     for _ in range(ROUNDS):
-        fine = _scaled(blocks, by)
+        fine = _scaled(blocks, by, owners)
         found = look(fine, by)
         noise = max((one.drawn for one in found), key=lambda drawn: drawn.log_evidence).noise
         if not (sizes > 0).any() or abs(noise - 1) < SETTLED:
@@ -188,21 +198,36 @@ def _found(
 
 
 def _averaged(
-    fine: Blocks, by: Scales, found: list[Found], time: Numbers, named: tuple[tuple[str, ...], ...], seconds: bool,
-    seed: int,
+    fine: Blocks, by: Scales, found: list[Found], curves: Curves | None, step: int, time: Numbers,
+    named: tuple[tuple[str, ...], ...], seconds: bool, seed: int,
 ) -> Track:  # fmt: skip
     """The kinds of motion that are not out of the question, followed, and weighed by their evidence."""
     evidence = np.array([one.drawn.log_evidence for one in found])
     shares = np.exp(evidence - np.logaddexp.reduce(evidence))
     kept = np.flatnonzero(shares > NEGLIGIBLE)
     weight, unit, kinds = shares[kept] / shares[kept].sum(), np.asarray(by.theta), [found[k] for k in kept]
-    several = [follow(fine, one, seed) for one in kinds]
+    p = len(unit)
+    at, shown = (np.zeros((0, 0)), np.zeros((0, p))) if curves is None else curves.shown(p)
+    points = None if curves is None else curves.at_points(step, len(time), p)
+    several = [follow(fine, one, Shapes(points, shown), seed) for one in kinds]
     best, lanes = int(np.argmax(weight)), len(several[0].size)
+    in_units = float(fine.freedom(p) * np.log(by.noise))
 
     def path(moments: list[Moments]) -> Path:
         theta = np.stack([one.theta for one in moments], axis=-1)
         known = mixed(theta, np.stack([one.covariance for one in moments], axis=-1), weight)
         return Path(known.theta * unit, known.covariance * np.outer(unit, unit))
+
+    def shapes() -> list[Curve]:
+        if curves is None:
+            return []
+        theta = np.stack([one.curves.theta for one in several], axis=-1)
+        known = mixed(theta, np.stack([one.curves.covariance for one in several], axis=-1), weight)
+        theta, stderr = (x.reshape(at.shape) for x in (known.theta, np.sqrt(known.covariance)))
+        return [
+            Curve(at[:, v], theta[:, v] * unit[i], stderr[:, v] * unit[i], named[0][i], named[1][i])
+            for v, i in enumerate(curves.which)
+        ]
 
     return Track(
         time=time,
@@ -216,11 +241,12 @@ def _averaged(
         ),
         smooth=float(shares @ [one.search.order > 0 for one in found]),
         noise=float(by.noise) * kinds[best].drawn.noise,
-        log_likelihood=float(np.logaddexp.reduce(evidence) - np.log(len(evidence))),
+        log_likelihood=float(np.logaddexp.reduce(evidence) - np.log(len(evidence)) - in_units),
         innovations=several[best].innovations,
         names=named[0],
         units=named[1],
         seconds=seconds,
+        curves=tuple(shapes()),
     )
 
 
@@ -232,7 +258,7 @@ def _middles(points: int, step: int, every: int, samples: int) -> Numbers:
 
 
 _compress = compiled(compress, static_argnums=3)
-_scales, _scaled = compiled(scales), compiled(scaled)
+_scales, _scaled = compiled(scales), compiled(scaled, static_argnums=2)
 
 
 def _checked(W: AnyArray, y: AnyArray, valid: AnyArray | None, grid: int) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:

@@ -85,6 +85,25 @@ class Jump(NamedTuple):
     probability: float
 
 
+class Curve(eqx.Module):
+    """A parameter as a function of what it depends on, at K values; where it drifts besides, as it is in the end."""
+
+    at: Float[AnyArray, " K"]
+    theta: Float[AnyArray, " K"]
+    """In units of the model."""
+    stderr: Float[AnyArray, " K"]
+    """Standard deviation of theta."""
+    name: str = eqx.field(static=True)
+    """Of the parameter."""
+    unit: str = eqx.field(static=True)
+
+    def interval(self, level: float = 0.95) -> tuple[Numbers, Numbers]:
+        """(K,): lower and upper ends of the bands that hold the truth with probability `level` at each value."""
+        covariance = np.asarray(self.stderr)[:, None, None] ** 2
+        low, high = Path(np.asarray(self.theta)[:, None], covariance).interval(level)
+        return low[:, 0], high[:, 0]
+
+
 class Track(eqx.Module, Result):
     """Parameters along a record, with what is known of how they move."""
 
@@ -109,6 +128,8 @@ class Track(eqx.Module, Result):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     seconds: bool = eqx.field(static=True)
+    curves: tuple[Curve, ...] = ()
+    """Parameters as functions of what they depend on, where `varies_with` says so."""
 
     @property
     def theta(self) -> Float[AnyArray, "G p"]:

@@ -8,9 +8,12 @@ become negative, a condition number enters once, and where nothing is measured n
 A record that is read backwards is the same, with the steps undone. What both passes know, joined, is the smoother; and
 what they disagree about is what a jump between them would explain.
 
-The state holds the p parameters, and before them, where they are smooth, what they are integrals of: their slopes, and
-what the slopes are integrals of. Several models, of one record or each of its own, stand side by side along the last
-axis of all arrays: the lanes. Scales are those of `blocks`: parameters of the order of one, noise of variance one.
+The state holds the p parameters; before them the coefficients of curves, where parameters depend on what is measured;
+and before these, where parameters are smooth, what they are integrals of: their slopes, and what the slopes are
+integrals of. Coefficients stay as they are.
+
+Several models, of one record or each of its own, stand side by side along the last axis of all arrays: the lanes.
+Scales are those of `blocks`: parameters of the order of one, noise of variance one.
 
 **Source:** Kalman 1960; Rauch, Tung and Striebel 1965; square roots: Potter 1963, Bierman, Factorization methods for
 discrete sequential estimation, 1977; two passes: Fraser and Potter 1969; jumps: de Jong and Penzer 1998.
@@ -58,6 +61,16 @@ class Motion(eqx.Module):
     a random walk themselves."""
     left: Float[AnyArray, "p L"] | None = None
     """What is left of slopes, and of what they are integrals of, after a step. None: all of it."""
+    spread: Float[AnyArray, "c L"] | None = None
+    """Standard deviation of the coefficients of curves, of which rows have columns in front of those of parameters."""
+
+    def of_lanes(self, rows: Float[Array, "r f ..."]) -> Array:
+        """A block's rows in terms of coefficients that have the variance one."""
+        if self.spread is None:
+            return rows
+        unit = jnp.concatenate([jnp.asarray(self.spread), jnp.ones_like(self.walk)])
+        unit = jnp.concatenate([unit, jnp.ones_like(unit[:1])])
+        return rows.reshape(*rows.shape, *(1,) * (unit.ndim + 1 - rows.ndim)) * unit
 
     def jump_variance(self, k: Array) -> Float[Array, "p L"]:
         """Of the jumps in front of point k: they are of the size of the parameter, one."""
@@ -153,7 +166,8 @@ def for_each(count: int, body: Callable[[Any, T], T], state: T) -> T:
 def start(motion: Motion) -> Float[Array, "d e L"]:
     """What is known before the record: a diagonal."""
     root = [motion.memory ** -(0.5 + k) for k in range(motion.order)]
-    diagonal = jnp.concatenate([*root, jnp.full_like(motion.walk, 1 / PRIOR)])
+    curves = [] if motion.spread is None else [jnp.ones_like(motion.spread)]
+    diagonal = jnp.concatenate([*root, *curves, jnp.full_like(motion.walk, 1 / PRIOR)])
     d = len(diagonal)
     return jnp.eye(d, d + 1, dtype=diagonal.dtype)[..., None] * diagonal[:, None]
 
@@ -170,12 +184,13 @@ def _stepped(known: Array, motion: Motion, sign: float) -> Array:
     Every integral takes up what it is an integral of, as it was before the step.
     """
     p, order = len(motion.walk), motion.order
-    parts = [known[:, k * p : (k + 1) * p] for k in range(order + 1)]
+    own = known.shape[1] - 1 - p
+    parts = [*(known[:, k * p : (k + 1) * p] for k in range(order)), known[:, own:-1]]
     left = jnp.ones_like(motion.slope) if motion.left is None else motion.left
     for k in range(order) if sign > 0 else reversed(range(order)):
         taken = (motion.slope if k == order - 1 else jnp.ones_like(motion.slope)) * parts[k + 1]
         parts[k] = left * parts[k] + taken if sign > 0 else (parts[k] - taken) / left
-    return jnp.concatenate([*parts, known[:, -1:]], axis=1)
+    return jnp.concatenate([*parts[:-1], known[:, order * p : own], parts[-1], known[:, -1:]], axis=1)
 
 
 def _less_certain(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Array]:
@@ -190,11 +205,12 @@ def _less_certain(known: Array, motion: Motion, jumps: Array) -> tuple[Array, Ar
         return for_each(p, one, state)
 
     state = known, jnp.zeros_like(known[0, 0])
+    first = len(known) - p
     if motion.order == 0:
-        return widen(0, own, state)
+        return widen(first, own, state)
     state = widen(0, jnp.ones_like(own), state)
     # What is smooth has no random step of its own but for jumps, which are rare.
-    return jax.lax.cond((own > 0).any(), lambda state: widen(motion.order * p, own, state), lambda state: state, state)
+    return jax.lax.cond((own > 0).any(), lambda state: widen(first, own, state), lambda state: state, state)
 
 
 def widened(known: Array, column: Array, variance: Array) -> tuple[Array, Array]:
@@ -232,7 +248,7 @@ def forward(rows: Float[Array, "G r f *L"], motion: Motion) -> tuple[Evidence, F
     def step(carry: tuple[Array, Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
         (known, lost, squares), (k, block) = carry, now
         before, less = moved(known, motion, motion.jump_variance(k))
-        known, left = with_rows(before, block)
+        known, left = with_rows(before, motion.of_lanes(block))
         return (known, lost + less, squares + left), before
 
     nothing = jnp.zeros_like(motion.walk[0])
@@ -251,25 +267,46 @@ def evidence(rows: Float[Array, "G r f *L"], motion: Motion) -> Evidence:
 
 
 def smoother(
-    rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"]
+    rows: Float[Array, "G r f *L"],
+    motion: Motion,
+    before: Float[Array, "G d e L"],
+    curves: Float[Array, "G p c"] | None = None,
 ) -> tuple[Float[Array, "G p L"], Float[Array, "G p p L"]]:
-    """Parameters at each point and their covariance, from the whole record; `before` as `forward` gives it."""
+    """Parameters at each point and their covariance, from the whole record; `before` as `forward` gives it, `curves` as
+    `seen` takes them."""
+    d, f = before.shape[1], rows.shape[2] - 1
 
-    d, p = before.shape[1], rows.shape[2] - 1
-
-    def look(known: Array, earlier: Array) -> tuple[Array, Array]:
+    def look(known: Array, earlier: Array, curve: Array | None) -> tuple[Array, Array]:
         whole, _ = triangularise(jnp.concatenate([earlier, known]), d, full=d)
-        theta, root = moments(whole[-p:, -p - 1 :])
+        theta, root = seen(whole[-f:, -f - 1 :], motion, curve)
         return theta, covariance_of(root)
 
-    return _backward(rows, motion, before, look)
+    return _backward(rows, motion, before, look, curves)
+
+
+def seen(
+    triangle: Float[Array, "f g *K"], motion: Motion, curve: Float[Array, "q c"] | None
+) -> tuple[Float[Array, "q *K"], Float[Array, "q f *K"]]:
+    """Parameters and a root of their covariance, from the triangle of coefficients and parameters.
+
+    **Arguments:** `curve` how much of each coefficient is in each parameter; None where there are none.
+    """
+    theta, root = moments(triangle)
+    if curve is None or motion.spread is None:
+        return theta, root
+    c = curve.shape[1]
+    share = curve.reshape(*curve.shape, *(1,) * (theta.ndim - 1)) * motion.spread
+    return (
+        theta[c:] + _summed(jnp.moveaxis(share, 1, 0), theta[:c, None]),
+        root[c:] + _summed(jnp.moveaxis(share, 1, 0)[:, :, None], root[:c, None]),
+    )
 
 
 def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"]) -> Shocks:
     """What a jump of each parameter in front of each point would explain; `before` as `forward` gives it."""
-    d, p = before.shape[1], rows.shape[2] - 1
+    d, p = before.shape[1], len(motion.walk)
 
-    def look(known: Array, earlier: Array) -> Shocks:
+    def look(known: Array, earlier: Array, _: Any) -> Shocks:
         # Before a jump by delta, the state was less by it.
         jump = jnp.concatenate([-earlier[:, -p - 1 : -1], jnp.zeros_like(known[:, -p - 1 : -1])])
         both = jnp.concatenate([earlier, known])
@@ -281,20 +318,24 @@ def shocks(rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, 
 
 
 def _backward(
-    rows: Float[Array, "G r f *L"], motion: Motion, before: Float[Array, "G d e L"], look: Callable[[Array, Array], T]
+    rows: Float[Array, "G r f *L"],
+    motion: Motion,
+    before: Float[Array, "G d e L"],
+    look: Callable[[Array, Array, Any], T],
+    curves: Float[Array, "G p c"] | None = None,
 ) -> T:
     """The record from its end: `look` sees what the points from each one on know of it, and those before it."""
 
-    def step(behind: Array, now: tuple[Array, Array, Array]) -> tuple[Array, T]:
-        k, block, earlier = now
-        known, _ = with_rows(behind, block)
-        seen = look(known, earlier)
+    def step(behind: Array, now: tuple[Array, Array, Array, Any]) -> tuple[Array, T]:
+        k, block, earlier, curve = now
+        known, _ = with_rows(behind, motion.of_lanes(block))
+        found = look(known, earlier, curve)
         known, _ = _less_certain(known, motion, motion.jump_variance(k))
-        return _stepped(known, motion, 1.0), seen
+        return _stepped(known, motion, 1.0), found
 
     d = before.shape[1]
     nothing = jnp.broadcast_to(NOTHING * jnp.eye(d, d + 1, dtype=rows.dtype)[..., None], before.shape[1:])
-    return jax.lax.scan(step, nothing, (jnp.arange(len(rows)), rows, before), reverse=True)[1]
+    return jax.lax.scan(step, nothing, (jnp.arange(len(rows)), rows, before, curves), reverse=True)[1]
 
 
 def own_triangle(known: Float[Array, "m e *K"], p: int) -> Float[Array, "p f *K"]:
@@ -324,6 +365,6 @@ def solved(triangle: Float[Array, "p p *K"], right: Float[Array, "p k *K"]) -> F
     return for_each(p, substitute, jnp.zeros_like(right))
 
 
-def covariance_of(root: Float[Array, "p p *K"]) -> Float[Array, "p p *K"]:
+def covariance_of(root: Float[Array, "p f *K"]) -> Float[Array, "p p *K"]:
     """`root @ root'`."""
     return (root[:, None] * root).sum(axis=2)

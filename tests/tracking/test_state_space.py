@@ -187,7 +187,7 @@ def test_compressed_and_merged_blocks_say_the_same() -> None:
     def said(each: int, together: int) -> float:
         blocks = merged(compress(W, y, np.ones(len(y)), each), together)
         found = evidence(blocks.rows, motion(NONE, NONE, []))
-        return float(found.log_likelihood(blocks.left, blocks.freedom)[0])
+        return float(found.log_likelihood(blocks.left, blocks.freedom(P))[0])
 
     wanted = said(36, 1)
     for each, together in ((1, 4), (5, 4)):

@@ -186,6 +186,55 @@ def test_kind_and_drift_are_found() -> None:
     assert 0.05 < spread[0] / size[0] < 0.5
 
 
+# ---- What depends on what is measured.
+
+
+def depending(seed: int) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    """Rows, torque, what the first parameter depends on, and this parameter: it changes fivefold."""
+    random = np.random.default_rng(seed)
+    at = 0.3 * np.sin(6 * np.pi * np.arange(N) / N)
+    theta = 3 + 2 * np.sin(5 * at)
+    W = random.normal(size=(N, P))
+    return W, W[:, 0] * theta - W[:, 1] + NOISE * random.normal(size=N), at, theta
+
+
+@pytest.fixture(scope="module")
+def with_curve() -> tuple[Track, Numbers]:
+    W, y, at, theta = depending(0)
+    return followed(W, y, varies_with={"stiffness": at}, names=("stiffness", "damping"), order=0), theta
+
+
+def test_a_parameter_that_depends_on_position_is_found_as_a_curve(with_curve: tuple[Track, Numbers]) -> None:
+    found, theta = with_curve
+    (curve,) = found.curves
+    low, high = curve.interval(0.999)
+    true = 3 + 2 * np.sin(5 * np.asarray(curve.at))
+    assert ((low < true) & (true < high)).all()
+    assert true.max() > 4.9 > 1.1 > true.min()
+    assert np.asarray(curve.stderr).max() < 0.3
+    for path, most in ((found.path, 0.08), (found.filtered, 0.4)):
+        error = np.asarray(path.theta)[20:, 0] - points(theta)[20:, 0]
+        assert np.sqrt(np.mean(error**2)) < most
+    low, high = found.path.interval()
+    assert ((low[:, 0] < points(theta)[:, 0]) & (points(theta)[:, 0] < high[:, 0])).mean() > 0.9
+    assert (found.drift.moves < 0.5).all()
+    assert np.ptp(found.value[:, 1]) < np.asarray(found.stderr)[:, 1].mean()
+
+
+def test_knowing_what_a_parameter_depends_on_pays_only_where_it_does(with_curve: tuple[Track, Numbers]) -> None:
+    W, y, at, theta = depending(0)
+    alone = followed(W, y, order=0)
+    assert with_curve[0].log_likelihood > alone.log_likelihood + 5
+    assert np.mean((alone.value[:, 0] - points(theta)[:, 0]) ** 2) > 2 * np.mean(
+        (with_curve[0].value[:, 0] - points(theta)[:, 0]) ** 2
+    )
+    W, y = record("stays")
+    free, plain = followed(W, y, varies_with={"theta_0": at}, order=0), followed(W, y, order=0)
+    assert free.log_likelihood < plain.log_likelihood
+    assert np.ptp(np.asarray(free.curves[0].theta)) < 0.1
+    np.testing.assert_allclose(free.stderr.mean(axis=0), plain.stderr.mean(axis=0), rtol=0.5)
+
+
 # ---- What must not matter, and where nothing is known.
 
 
@@ -301,6 +350,10 @@ def test_table_has_a_row_for_each_point() -> None:
         ({"names": ("a",)}, "one for each"),
         ({"order": 3}, "order is 3"),
         ({"noise": [Autoregression()] * 2}, "one for each"),
+        ({"varies_with": {"stiffness": np.arange(N)}}, "the parameters are theta_0"),
+        ({"varies_with": {"theta_1": np.arange(3)}}, "give one number for each of 600 rows"),
+        ({"varies_with": {"theta_1": np.full(N, np.inf)}}, "not finite"),
+        ({"varies_with": {"theta_1": np.ones(N)}}, "nothing can vary with it"),
         ({"W": np.ones((N, P, 1, 1))}, "W has shape"),
         ({"y": np.full(N, np.nan)}, "not finite"),
     ],
