@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.recordings.errors import RecordingError, UnavailableError
-from jaximp.recordings.readers import hdf5, mat, npz, parquet, text
+from jaximp.recordings.readers import c3d, excel, hdf5, json_lines, mat, npz, parquet, rosbag, text
 from jaximp.recordings.readers.disguise import refuse_disguise
 from jaximp.recordings.readers.found import AS_SEEN, Found, TextOptions
 
@@ -34,10 +34,15 @@ class Format:
 
 FORMATS = {
     **dict.fromkeys((".csv", ".txt", ".tsv"), Format(text.read, text.count, text=True)),
+    **dict.fromkeys((".dat", ".asc", ".sto", ".mot", ".lvm"), Format(text.read, text.count, text=True)),
+    **dict.fromkeys((".xlsx", ".xls", ".xlsb", ".ods"), Format(excel.read, excel.count, text=True)),
+    **dict.fromkeys((".jsonl", ".ndjson"), Format(json_lines.read, json_lines.count, matrices=True)),
     ".parquet": Format(parquet.read, parquet.count, matrices=True),
     ".feather": Format(parquet.read_feather, parquet.count_feather, matrices=True),
     ".mat": Format(mat.read, mat.count, matrices=True),
     **dict.fromkeys((".h5", ".hdf5"), Format(hdf5.read, hdf5.count, matrices=True)),
+    ".c3d": Format(c3d.read, c3d.count, matrices=True),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), Format(rosbag.read, rosbag.count, matrices=True)),
     ".npz": Format(npz.read, npz.count, matrices=True),
 }
 """By the extension of the file, in small letters."""

@@ -11,6 +11,10 @@ import numpy as np
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.columns import Index, head_of, largest, pick, require, require_variable, steps_of
 from jaximp.recordings.readers.found import Found
+from jaximp.recordings.readers.matlab_objects import column_of_object
+
+OBJECTS = (b"table", b"timetable", b"timeseries", b"string", b"datetime", b"duration")
+"""Classes of MATLAB that are no plain arrays."""
 
 
 def read(path: Path, names: Sequence[str], matlab: bool = False) -> Found:
@@ -20,21 +24,17 @@ def read(path: Path, names: Sequence[str], matlab: bool = False) -> Found:
 
     notes: list[str] = []
     with h5py.File(path, "r") as file:
-        return Found({name: _value(file, name, matlab, notes) for name in names}, notes=tuple(notes))
+        return Found({name: _value(path, file, name, matlab, notes) for name in names}, notes=tuple(notes))
 
 
-def _value(file: Any, name: str, matlab: bool, notes: list[str]) -> Any:
+def _value(path: Path, file: Any, name: str, matlab: bool, notes: list[str]) -> Any:
     dataset, steps = _find(file, name, matlab)
     kind = dataset.attrs.get("MATLAB_class")
     if kind == b"char":
         raise RecordingError(f"variable {name!r} holds text, not numbers; name a numeric variable")
-    if dataset.attrs.get("MATLAB_object_decode") is not None or kind in (
-        b"table",
-        b"timetable",
-        b"timeseries",
-        b"string",
-    ):
-        raise RecordingError(unreadable(head_of(name), (kind or b"object").decode()))
+    if dataset.attrs.get("MATLAB_object_decode") is not None or kind in OBJECTS:
+        of = kind.decode() if isinstance(kind, bytes) else "object"
+        return column_of_object(path, head_of(name), steps, name, of, notes)
     value = dataset[()]
     return pick(np.transpose(value) if matlab else value, steps, name, notes)
 
@@ -101,24 +101,6 @@ def _datasets(file: Any, matlab: bool) -> list[str]:
     found: list[str] = []
     file.visititems(lambda key, item: found.append(key) if isinstance(item, h5py.Dataset) else None)
     return [key.replace("/", ".") if matlab else key for key in found if not key.startswith("#")]
-
-
-def unreadable(name: str, kind: str) -> str:
-    """What is said of a MATLAB object, which only MATLAB reads."""
-    how = {
-        "table": f"save it with s = table2struct({name}, 'ToScalar', true)",
-        "timetable": f"save it with s = table2struct(timetable2table({name}), 'ToScalar', true)",
-        "timeseries": f"save {name}.Time and {name}.Data as variables of their own",
-        "string": f"save it as char({name}), or leave it",
-        "datetime": f"save seconds({name} - {name}(1))",
-        "duration": f"save seconds({name})",
-    }.get(kind, "save its numbers as plain variables")
-    a = "an object" if kind == "object" else f"a {kind}"
-    return (
-        f"{name!r} is a MATLAB {kind}, which only MATLAB reads: {how}"
-        if kind != "object"
-        else (f"{name!r} is {a} of MATLAB, which only MATLAB reads: {how}")
-    )
 
 
 def count(path: Path, names: Sequence[str], matlab: bool = False) -> int:

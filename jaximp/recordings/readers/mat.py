@@ -14,6 +14,7 @@ from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers import hdf5
 from jaximp.recordings.readers.columns import head_of, largest, pick, require_variable, steps_of
 from jaximp.recordings.readers.found import Found
+from jaximp.recordings.readers.matlab_objects import column_of_object
 
 MOST_NUMBERS = 1_000_000_000
 """A struct that holds more numbers than this is not unpacked to count them."""
@@ -48,12 +49,16 @@ def read(path: Path, names: Sequence[str]) -> Found:
     for name, (head, _) in heads.items():
         if head not in variables:
             require_variable(head, plain, name)
-        if variables[head].kind == OBJECT:
-            raise RecordingError(hdf5.unreadable(head, variables[head].of))
-    content = loadmat(path, variable_names=[head for head, _ in heads.values()])
+    content = loadmat(path, variable_names=[head for head, _ in heads.values() if variables[head].kind != OBJECT])
     notes: list[str] = []
     return Found(
-        {name: pick(content[head], steps, name, notes) for name, (head, steps) in heads.items()}, notes=tuple(notes)
+        {
+            name: column_of_object(path, head, steps, name, variables[head].of, notes)
+            if variables[head].kind == OBJECT
+            else pick(content[head], steps, name, notes)
+            for name, (head, steps) in heads.items()
+        },
+        notes=tuple(notes),
     )
 
 

@@ -29,7 +29,12 @@ def read_feather(path: Path, names: Sequence[str]) -> Found:
 
     with pyarrow.memory_map(str(path)) as source:
         table = feather.read_table(source)
-        return _columns(table, _heads(names, table.schema))
+        return columns_of_table(table, names)
+
+
+def columns_of_table(table: Any, names: Sequence[str]) -> Found:
+    """The columns of a table of pyarrow, or parts of them."""
+    return _columns(table, _heads(names, table.schema))
 
 
 def _heads(names: Sequence[str], schema: Any) -> dict[str, str]:

@@ -255,7 +255,9 @@ def names_in(line: str, layout: Layout) -> tuple[str, ...] | None:
             if separator == " " and layout.separator not in " \t":
                 continue  # the blanks of a sentence
             fields = _names(text, separator)
-            for names in [fields, fields[:-1] if fields and not fields[-1] else None, [*fields, ""]]:
+            # LabVIEW names a comment behind the last column, which the rows do not have.
+            spare = fields and fields[-1] in ("", "Comment")
+            for names in [fields, fields[:-1] if spare else None, [*fields, ""]]:
                 if names is None or len(names) != layout.width or (names == [*fields, ""] and any(layout.numeric[-1:])):
                     continue
                 if _plausible(names, layout):

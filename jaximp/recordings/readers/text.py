@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import codecs
 import gzip
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,8 @@ from jaximp.recordings.readers.sniff import (
 
 BYTES_OF_HEAD = 1 << 18
 """Of a file, from which its first lines are taken."""
+DEGREES = re.compile(r"inDegrees\s*=\s*(yes|true|1)", re.IGNORECASE)
+"""What OpenSim writes above angles in degrees."""
 MARKS = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 CONTROL = bytes(sorted({*range(32), 127} - {*b"\t\n\r\f\v\x1a"}))
 """What no text holds."""
@@ -62,6 +65,7 @@ def read_text(
         values={name: table.values[i] for name, i in columns.items()},
         names={name: layout.names[i] for name, i in columns.items() if layout.names and isinstance(name, int)},
         units={name: layout.units[i] for name, i in columns.items() if layout.units and layout.units[i]},
+        angles="deg" if any(DEGREES.fullmatch(line.strip()) for line in lines[: layout.first]) else None,
         notes=(*notes, *layout.notes, *left_out, *table.notes),
     )
 
