@@ -56,13 +56,17 @@ def load_recording(
 
     **Arguments:**
 
-    - `path`: .csv, .txt or .tsv (comma, semicolon or tab), .parquet, .mat (v5 or v7.3), .h5, .hdf5 or .npz. A column
-      is a header's name, a variable (`data.q` inside a MATLAB struct) or a dataset's path; MATLAB, HDF5 and NPZ
-      variables may be (N, n), one column per joint. In text files a column may also be a number that counts from 1:
-      a file whose first line holds numbers alone has no header, and only numbers.
+    - `path`: text (.csv, .txt, .tsv, .dat, .asc, OpenSim's .sto and .mot, LabVIEW's .lvm; also .gz), .parquet,
+      .feather, .jsonl, .mat (v5 or v7.3), .h5, .hdf5, .npz; with the extra `formats` also spreadsheets (.xlsx, .xls, .xlsb,
+      .ods), .c3d and ROS bags (.bag, .db3, .mcap). A column is a header's name, a variable (`data.q` inside a MATLAB
+      struct) or a dataset's path. Variables may be (N, n), one column per joint; one of them is `data(:,2)` as MATLAB
+      counts, `data[:,1]` as numpy does, or `data[2]`, which counts from 1. `data(2).q` is that of an array of structs.
+      In text files and spreadsheets a column may also be a number that counts from 1: where no line names the columns,
+      they have only numbers.
     - `time` [s] (a column, or `{column, unit}`) or else `sample_rate`: a number [Hz], or a scalar variable in the file.
     - `position`, `torque`, `velocity`, `acceleration`, `force`, `reference`, `command`: a column, a list of columns
       (one per joint), or `{columns = ..., unit = "deg", sign = -1, gain = 2.5}`. Without `unit`, that of the
+      column's name (`angle (deg)`, `torque_mNm`) or of a row of units, which is noted; else that of the
       channel: rad, N m, rad/s, rad/s^2 (prismatic: m, N, m/s, m/s^2), force N; `reference` is a position, `command`
       (the perturbation) a torque. A bare `gain` multiplies the column and `unit` is that of the product; with
       `gain = "35.1507 N/V"`, `unit` is that of the column. `delay` [s] says how late a channel was recorded, by a
@@ -77,6 +81,11 @@ def load_recording(
       acceleration and reference are divided by it, torque and command are multiplied; `force` acts at the endpoint and
       stays.
     - `rows`: the first and the last row of the file that count, from 1 (a header is none), both included.
+    - `duplicates`: `"drop"` keeps the first of rows with one time stamp; rows that are the same throughout need no key.
+    - `header`, `separator`, `decimal`, `encoding`, `bad_lines`, of text alone, where what is seen in the file is not
+      what it is: the line that names the columns (0 if none does), `";"` or `"whitespace"`, `","`, `"cp1252"`, and `"drop"`
+      for rows that cannot be read, which are refused else. In a channel's table, `despite_name = true` says that the
+      column's name is wrong about its unit.
 
     **Returns:** the recording on a uniform grid; see `recording_from_arrays` for sampling, gaps and NaN.
 
