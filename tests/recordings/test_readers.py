@@ -175,7 +175,10 @@ def test_other_bad_files(tmp_path: Path) -> None:
         load_recording(tmp_path / "text.parquet", **MAPPING)
 
 
-@given(content=st.binary(max_size=200), extension=st.sampled_from(["csv", "parquet", "feather", "jsonl", "mat", "h5", "npz", "xlsx", "bag"]))
+EXTENSIONS = ["csv", "parquet", "feather", "jsonl", "mat", "h5", "npz", "xlsx", "bag"]
+
+
+@given(content=st.binary(max_size=200), extension=st.sampled_from(EXTENSIONS))
 @settings(max_examples=150, deadline=None, derandomize=True)
 def test_arbitrary_bytes_give_one_line(
     tmp_path_factory: pytest.TempPathFactory, content: bytes, extension: str
