@@ -49,6 +49,7 @@ OBVIOUS: dict[str, str | bytes] = {
     "comma after every row": H + rows().replace("\n", ",\n"),
     "comma after the header": "t,q,tau,\n" + rows(),
     "comma after all lines": "t,q,tau,\n" + rows().replace("\n", ",\n"),
+    "an empty column at the end": "t,q,tau,remarks\n" + rows().replace("\n", ",\n"),
     "no line break at the end": H + rows().rstrip("\n"),
     "a column of words": "t,q,tau,phase\n" + rows().replace("\n", ",at rest\n"),
     "an empty line above": "\n\n" + H + rows(),

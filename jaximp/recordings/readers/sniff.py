@@ -54,6 +54,8 @@ class Layout:
     """(width,) the columns that hold numbers."""
     first: int
     """The line of the first row, from 0."""
+    trailing: bool = False
+    """Whether a separator, or an empty column, stands behind the last field of a row."""
     names: tuple[str, ...] | None = None
     """(width,) of the columns; None where no line names them."""
     header: int = -1
@@ -140,7 +142,7 @@ def _judged(lines: Sequence[str], separator: str, decimal: str) -> tuple[float, 
     if first is None or not known:
         return None
     # A wrong separator or decimal mark leaves pieces of numbers among few that are whole.
-    return sum(known) / len(known), Layout(separator, decimal, width, numeric, first)
+    return sum(known) / len(known), Layout(separator, decimal, width, numeric, first, len(rows[first]) > width)
 
 
 def _width(row: Sequence[str]) -> int:
@@ -256,7 +258,7 @@ def names_in(line: str, layout: Layout) -> tuple[str, ...] | None:
                 continue  # the blanks of a sentence
             fields = _names(text, separator)
             # LabVIEW names a comment behind the last column, which the rows do not have.
-            spare = fields and fields[-1] in ("", "Comment")
+            spare = fields and (layout.trailing or fields[-1] in ("", "Comment"))
             for names in [fields, fields[:-1] if spare else None, [*fields, ""]]:
                 if names is None or len(names) != layout.width or (names == [*fields, ""] and any(layout.numeric[-1:])):
                     continue

@@ -141,9 +141,7 @@ def _start(content: memoryview, line: int) -> int:
 def _without_tail(body: memoryview, layout: Layout) -> tuple[memoryview, list[str]]:
     """The rows without what at the end is none: a summary, a comment, a line that was cut."""
     tail = bytes(body[-BYTES_OF_HEAD // 4 :])
-    stripped = (
-        tail.rstrip(b"\r\n\t ;,|\x1a\x00") if not tail.rstrip(b"\r\n \x1a\x00") else tail.rstrip(b"\r\n \x1a\x00")
-    )
+    stripped = tail.rstrip(b"\r\n \x1a\x00")
     ended = len(stripped) < len(tail)
     end = len(body) - len(tail) + len(stripped)
     lines = stripped.decode(errors="replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
