@@ -34,6 +34,7 @@ from .filters import kept_variance as kept_variance
 from .filters import padded_filter as padded_filter
 from .filters import reach as reach
 from .filters import zero_phase_matrix as zero_phase_matrix
+from .filters import zero_phase_response as zero_phase_response
 from .samples import fill_gaps as fill_gaps
 from .samples import jumps as jumps
 from .samples import lengthen_gaps as lengthen_gaps

@@ -410,6 +410,12 @@ def reach(sos: Sections, share: float = 0.01) -> int:
     return len(response) // 2 - int(outside.sum())
 
 
+def zero_phase_response(sos: Sections) -> NDArray[np.float64]:
+    """The impulse response of the forward and backward filter, from its middle on until it has died out."""
+    response = np.fft.irfft(_zero_phase_gain(sos))
+    return response[: len(response) // 2]
+
+
 def _zero_phase_gain(sos: Sections) -> NDArray[np.float64]:
     """Amplitude of the forward and backward filter, on a grid fine enough for its slowest pole to die out."""
     from scipy.signal import freqz_sos

@@ -1,0 +1,13 @@
+from .calibration import Calibration as Calibration
+from .calibration import calibrate as calibrate
+from .calibration import live_of as live_of
+from .calibration import load_calibration as load_calibration
+from .calibration import load_state as load_state
+from .calibration import save_calibration as save_calibration
+from .estimator import Estimate as Estimate
+from .estimator import Live as Live
+from .estimator import State as State
+from .estimator import init as init
+from .estimator import run as run
+from .estimator import step as step
+from .front import Sample as Sample
