@@ -1,4 +1,4 @@
-"""The command line: `jaximp demo`, `init`, `check`, `identify`, `posterior`, `design`, `batch` and others.
+"""The command line: `jaximp demo`, `init`, `check`, `identify`, `monitor`, `posterior`, `design`, `batch` and others.
 
 One command a file. A file imports what its command needs when that runs: help must not wait for it.
 """
@@ -23,6 +23,7 @@ from jaximp.cli.design import design
 from jaximp.cli.export import export
 from jaximp.cli.identify import identify
 from jaximp.cli.init import init
+from jaximp.cli.monitor import monitor
 from jaximp.cli.posterior import posterior
 from jaximp.cli.reproduce import reproduce
 from jaximp.cli.simulate import simulate
@@ -91,5 +92,5 @@ def options(
     """What can be asked of jaximp itself."""
 
 
-for each in (demo, init, check, identify, posterior, design, export, simulate, batch, reproduce):
+for each in (demo, init, check, identify, monitor, posterior, design, export, simulate, batch, reproduce):
     app.command()(prepared(each))

@@ -111,7 +111,7 @@ def judge(
     at_limit = _share_at_limit(prepared.recording, rows.time[starts], rows.time[starts + place.window - 1])
     at_limit = np.broadcast_to(at_limit, starts.shape)[points.window]
     measured = replace(measured, tested=bool(misfits), missing=of_model.why, remedy=of_model.remedy, at_limit=at_limit)
-    measured = _against_other_people(measured, model, fit, limits)
+    measured = against_other_people(measured, model, fit, limits)
     if is_chain(model.roles):
         each = {name: measure(replace(limits, parameters=(name,))) for name in model.names}
         each = {
@@ -211,7 +211,7 @@ def _with_open_moves(fit: SlidingFit, moves: Numbers) -> SlidingFit:
     return eqx.tree_at(lambda f: f.stderr, fit, jnp.sqrt(jnp.asarray(fit.stderr) ** 2 + moves**2))
 
 
-def _against_other_people(measured: Windows, model: Model, fit: SlidingFit, limits: TrustLimits) -> Windows:
+def against_other_people(measured: Windows, model: Model, fit: SlidingFit, limits: TrustLimits) -> Windows:
     """With what a human joint can have; nothing is known of anything else."""
     ranges = plausibility.ranges_of(limits.one_joint_name)
     if ranges is None or not isinstance(model, HumanJoint) or model.units[2] != plausibility.UNITS[2]:

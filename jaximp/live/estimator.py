@@ -29,8 +29,9 @@ from jaximp.least_squares.streams import (
     whiten_row,
 )
 from jaximp.live.front import Front, Held, Row, Sample, nothing_held, take_sample
-from jaximp.numerics.compilation import compiled, filter_compiled
+from jaximp.numerics.compilation import filter_compiled, options
 from jaximp.tracking.online import Followers, Frozen, begin_tracking, track_row
+from jaximp.types import AnyArray
 
 
 class Live(eqx.Module):
@@ -99,8 +100,8 @@ def step(live: Live, state: State, sample: Sample) -> tuple[State, Estimate]:
     estimate = Estimate(
         theta=at.theta,
         stderr=jnp.sqrt(jnp.diagonal(at.covariance)),
-        surprise=jnp.where(at.count > 0, at.squares / jnp.maximum(at.count, 1e-300), jnp.nan),
-        surprises=at.count,
+        surprise=jnp.where(at.surprises > 0, at.squares / jnp.maximum(at.surprises, 1e-300), jnp.nan),
+        surprises=at.surprises,
         window=state.fit,
         new=new,
         measured=row.measured | ~row.due,
@@ -142,6 +143,10 @@ def compiled_rows(front: Front, held: Held, samples: Sample) -> tuple[Held, Row]
     return filter_compiled(rows)(front, held, samples)
 
 
+CHUNKS = (256, 16, 1)
+"""How many samples `Stepper.many` takes at once: it is compiled for these."""
+
+
 class Stepper:
     """`step`, compiled, with all of the state in one array: most of the time of a step went into handing arrays over.
 
@@ -150,27 +155,49 @@ class Stepper:
 
     def __init__(self, live: Live, state: State):
         arrays, static = eqx.partition(live, eqx.is_array)
-        self._live, self._unpack_live = _packed(arrays)
-        self._state, self._unpack_state = _packed(state)
+        self.live = live
+        self._packed_live, unpack_live = _pack(arrays), _unpacker(arrays)
+        self._state, self._unpack_state = _pack(state), _unpacker(state)
 
-        def advance(packed_live: Array, packed: Array, sample: Array) -> tuple[Array, Array]:
-            whole = eqx.combine(self._unpack_live(packed_live), static)
-            state, estimate = step(whole, self._unpack_state(packed), Sample(sample[0], sample[1], sample[2] > 0))
-            return _pack(state), _pack(estimate)
+        def advance(packed_live: Array, packed: Array, samples: Array) -> tuple[Array, Array]:
+            whole = eqx.combine(unpack_live(packed_live), static)
+
+            def one(state: State, x: Array) -> tuple[State, Array]:
+                state, estimate = step(whole, state, Sample(x[0], x[1], x[2] > 0))
+                return state, _pack(estimate)
+
+            begin = self._unpack_state(packed)
+            if len(samples) == 1:
+                state, found = one(begin, samples[0])
+                return _pack(state), found[None]
+            state, found = jax.lax.scan(one, begin, samples)
+            return _pack(state), found
 
         shapes = jax.eval_shape(partial(step, live), state, Sample(0.0, 0.0, True))[1]
-        self._advance, self._unpack = compiled(advance, donate_argnums=1), _unpacker(shapes, np)
+        self._advance, self._unpack = jax.jit(advance, donate_argnums=1, compiler_options=options()), _unpacker(shapes)
 
-    def __call__(self, position: float, torque: float, valid: bool) -> Estimate:
+    def compile(self) -> None:
+        """For all `CHUNKS`, so that the first samples need not wait."""
+        for count in CHUNKS:
+            self._advance(self._packed_live, jnp.array(self._state), np.zeros((count, 3)))
+
+    def __call__(self, position: float, torque: float, valid: bool = True) -> Estimate:
         """What is known with one more sample."""
-        self._state, found = self._advance(self._live, self._state, np.array([position, torque, valid]))
-        estimate: Estimate = self._unpack(np.asarray(found))
+        return self._taken(np.array([[position, torque, valid]]), 0)
+
+    def many(self, position: AnyArray, torque: AnyArray, valid: AnyArray) -> Estimate:
+        """What is known with each of N more samples, N being one of `CHUNKS`."""
+        return self._taken(np.stack([position, torque, np.asarray(valid, float)], axis=1), slice(None))
+
+    def _taken(self, samples: AnyArray, which: Any) -> Estimate:
+        self._state, found = self._advance(self._packed_live, self._state, samples)
+        estimate: Estimate = self._unpack(np.asarray(found)[which])
         return estimate
 
     @property
     def state(self) -> State:
         """As it is now."""
-        state: State = jax.tree.map(jnp.copy, self._unpack_state(self._state))
+        state: State = jax.tree.map(jnp.array, self._unpack_state(self._state))
         return state
 
 
@@ -178,24 +205,16 @@ def _pack(tree: Any) -> Array:
     return jnp.concatenate([jnp.ravel(jnp.asarray(leaf)).astype(float) for leaf in jax.tree.leaves(tree)])
 
 
-def _packed(tree: Any) -> tuple[Array, Callable[[Any], Any]]:
-    return _pack(tree), _unpacker(tree, jnp)
-
-
-def _unpacker(tree: Any, xp: Any) -> Callable[[Any], Any]:
-    """From one array back to a tree like this one."""
+def _unpacker(tree: Any) -> Callable[[Any], Any]:
+    """From one array back to a tree like this one; or from several, side by side."""
     leaves, structure = jax.tree.flatten(tree)
-    shapes, kinds = (
-        [np.shape(leaf) if not hasattr(leaf, "shape") else leaf.shape for leaf in leaves],
-        [np.dtype(leaf.dtype) for leaf in leaves],
-    )
+    shapes, kinds = [leaf.shape for leaf in leaves], [np.dtype(leaf.dtype) for leaf in leaves]
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes]).tolist()
+    pieces = list(zip([0, *ends], ends, shapes, kinds, strict=False))
 
     def unpack(packed: Any) -> Any:
-        parts = [
-            packed[first:end].reshape(shape).astype(kind)
-            for first, end, shape, kind in zip([0, *ends], ends, shapes, kinds, strict=False)
-        ]
+        several = packed.shape[:-1]
+        parts = [packed[..., a:b].reshape(*several, *shape).astype(kind) for a, b, shape, kind in pieces]
         return jax.tree.unflatten(structure, parts)
 
     return unpack

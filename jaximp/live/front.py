@@ -82,7 +82,7 @@ class Held(NamedTuple):
     """Samples in a row whose motion comes from measurements."""
     fast: Bool[Array, " D"]
     """Which of them were fast enough; the latest stands last."""
-    index: Int[Array, ""]
+    number: Int[Array, ""]
     """How many samples there were."""
 
 
@@ -139,7 +139,7 @@ def nothing_held(front: Front) -> Held:
         passed=begin_causal(front.causal, jnp.zeros(front.columns)),
         clean=zero,
         fast=jnp.zeros(round(front.causal.late) + 1, bool),
-        index=zero,
+        number=zero,
     )
 
 
@@ -162,10 +162,10 @@ def take_sample(front: Front, held: Held, sample: Sample) -> tuple[Held, Row]:
     clean = jnp.where(measured, held.clean + 1, 0)
     fast = jnp.append(held.fast[1:], front.model.speed(dq[None])[0] >= front.min_velocity)
     settled = clean >= front.causal.settles
-    due = held.index % front.decimate == 0
+    due = held.number % front.decimate == 0
     row = Row(filtered, due, due & settled & fast[0], due & settled)
     missing = jnp.where(valid, 0, held.missing + 1)
-    return Held(position, torque, known, missing, passed, clean, fast, held.index + 1), row
+    return Held(position, torque, known, missing, passed, clean, fast, held.number + 1), row
 
 
 def _with_sample(front: Front, held: Held, sample: Sample, valid: Array) -> tuple[Array, Array, Array]:

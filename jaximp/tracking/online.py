@@ -23,8 +23,10 @@ from jaximp.tracking.paths import KINDS, _found
 from jaximp.tracking.state_space import Motion, covariance_of, log_volume, moments, moved, start, with_rows
 from jaximp.types import AnyArray
 
-SURPRISED = 50.0
+SURPRISED = 25.0
 """Points of the grid over which innovations are averaged."""
+MOST_SURPRISE = 9.0
+"""Square of an innovation that counts at most, so that a single leap is forgotten soon; of noise it takes off 2 %."""
 
 
 class Kind(eqx.Module):
@@ -89,7 +91,7 @@ class Followers(NamedTuple):
     covariance: Float[Array, "p p"]
     squares: Float[Array, ""]
     """Of innovations, standardised, with a memory of `SURPRISED` points."""
-    count: Float[Array, ""]
+    surprises: Float[Array, ""]
     """How many of them."""
 
 
@@ -166,7 +168,7 @@ def track_row(frozen: Frozen, at: Followers, row: Float[Array, " f"], valid: Arr
 
 def _next_point(frozen: Frozen, at: Followers) -> Followers:
     bank, theta, covariance, squares = _advanced(frozen, at.bank, at.rows, at.points)
-    units, keeps = jnp.asarray(frozen.theta), 1 - 1 / SURPRISED
+    units, keeps, rows = jnp.asarray(frozen.theta), 1 - 1 / SURPRISED, (at.rows != 0).any(axis=1).sum()
     return Followers(
         bank=bank,
         points=at.points + 1,
@@ -174,8 +176,8 @@ def _next_point(frozen: Frozen, at: Followers) -> Followers:
         place=jnp.zeros_like(at.place),
         theta=theta * units,
         covariance=covariance * units[:, None] * units,
-        squares=keeps * at.squares + squares,
-        count=keeps * at.count + (at.rows != 0).any(axis=1).sum(),
+        squares=keeps * at.squares + jnp.minimum(squares, MOST_SURPRISE * rows),
+        surprises=keeps * at.surprises + rows,
     )
 
 
