@@ -4,6 +4,7 @@ from . import design as design
 from . import identification as identification
 from . import jobs as jobs
 from . import least_squares as least_squares
+from . import live as live
 from . import models as models
 from . import motion as motion
 from . import perturbation as perturbation

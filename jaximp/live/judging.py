@@ -15,7 +15,7 @@ from jaximp.live.estimator import Estimate
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.verdicts import POOR, TRUSTED, Rule, Verdict
 from jaximp.trust.window_rules import RULES, Windows, measure_windows
-from jaximp.types import Numbers
+from jaximp.types import AnyArray, Numbers
 
 WARMING_UP = "warming up"
 """The verdict before there is an estimate."""
@@ -110,5 +110,5 @@ def _verdict(stream: Stream, limits: TrustLimits) -> Verdict:
     return Verdict(TRUSTED, "", "")
 
 
-def _row(value: object) -> Numbers:
+def _row(value: AnyArray) -> AnyArray:
     return np.asarray(value)[None]

@@ -8,7 +8,7 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Thread
-from typing import Protocol, TextIO
+from typing import Any, Protocol, runtime_checkable
 
 from jaximp.live.monitor import Update
 
@@ -18,6 +18,7 @@ PATIENCE = 2.0
 """Seconds that it has at the end."""
 
 
+@runtime_checkable
 class Sink(Protocol):
     """What takes updates, in a thread of its own."""
 
@@ -67,9 +68,9 @@ class Aside:
 
 
 class JsonLines:
-    """One line of JSON for each update."""
+    """One line of JSON for each update, on a stream of text."""
 
-    def __init__(self, stream: TextIO):
+    def __init__(self, stream: Any):
         self._stream = stream
 
     def write(self, update: Update) -> None:

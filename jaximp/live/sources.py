@@ -7,7 +7,7 @@ import queue
 import select
 import time
 from collections.abc import Iterable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,6 +24,7 @@ MOST_PUSHED = 1_000_000
 READ = 1 << 16
 
 
+@runtime_checkable
 class Source(Protocol):
     """What a monitor listens to."""
 

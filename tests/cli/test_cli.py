@@ -142,7 +142,9 @@ def test_every_paper_can_be_reproduced() -> None:
     assert there == {paper.value for paper in Paper} == {"tout2023", "lakatos2011", "borner2020"}
 
 
-COMMANDS = ["demo", "init", "check", "identify", "posterior", "design", "export", "simulate", "batch", "reproduce"]
+COMMANDS = [
+    "demo", "init", "check", "identify", "monitor", "posterior", "design", "export", "simulate", "batch", "reproduce",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -152,7 +154,7 @@ def test_help_teaches(run, command: str) -> None:  # type: ignore[no-untyped-def
     assert "Usage" in said
     assert len(said) > 300
     assert run(command, "-h")[:2] == (0, said)
-    if command not in ("init", "check", "export"):
+    if command not in ("init", "check", "export", "monitor"):
         assert re.search(r"--out +-o ", said)
 
 

@@ -18,8 +18,8 @@ TESTS = ROOT / "tests"
 
 PACKAGES = (
     "types", "results", "numerics", "signals", "recordings", "motion", "models", "least_squares", "tracking",
-    "consistency", "trust", "identification", "perturbation", "posterior", "design", "simulation", "jobs", "plots",
-    "reports", "batch", "papers", "cli",
+    "consistency", "trust", "identification", "perturbation", "posterior", "design", "simulation", "jobs", "live",
+    "plots", "reports", "batch", "papers", "cli",
 )  # fmt: skip
 """From the ground up: a package imports from those before it, and from itself."""
 
