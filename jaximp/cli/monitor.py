@@ -71,7 +71,7 @@ def monitor(
     """
     from jaximp.live.calibration import save_calibration, state_arrays
 
-    job, recording, alone = _demo() if demo else _job(job_file)
+    job, recording, alone = _demo() if demo else _job(job_file, source == "replay")
     if demo and calibrate == 20.0:
         calibrate = DEMO_CALIBRATES
     watch, columns, joint = _monitor(
@@ -79,7 +79,7 @@ def monitor(
         seconds=calibrate, estimate=estimate, every=every,
     )  # fmt: skip
     as_json = (not demo and not sys.stdout.isatty()) if json is None else json
-    reads = _source(source, job, recording, speed, columns, token)
+    reads = _source(source, recording, speed, columns, token)
     try:
         sinks = _sinks(as_json, udp, lsl)
         kept = None if log is None else _log(log, job, joint, alone if demo else None)
@@ -90,8 +90,8 @@ def monitor(
 
     session = Session(reads, watch, sinks, kept, _say)
     _run(session, seconds)
-    if save is not None and watch.calibration is not None and watch.state is not None:
-        save_calibration(watch.calibration, save, state_arrays(watch.state))
+    if save is not None and watch.calibration is not None and watch.state is not None and watch.clock is not None:
+        save_calibration(watch.calibration, save, state_arrays(watch.state, watch.clock.next))
         _say(f"calibration and state: {save}")
     elif save is not None:
         _say("there is no calibration to save yet")
@@ -107,7 +107,7 @@ def _say(line: str) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
-def _job(path: Path | None) -> tuple[WindowJob, None, Any]:
+def _job(path: Path | None, replayed: bool) -> tuple[WindowJob, Recording | None, Any]:
     from jaximp.jobs.job import TrialsJob, read_job
 
     if path is None:
@@ -116,7 +116,7 @@ def _job(path: Path | None) -> tuple[WindowJob, None, Any]:
     if isinstance(job, TrialsJob):
         raise ValueError("monitor identifies one joint: a job with [trials] has none")
     alone = job.load_robot_alone()
-    return job, None, alone[0] if isinstance(alone, tuple) else alone
+    return job, job.load() if replayed else None, alone[0] if isinstance(alone, tuple) else alone
 
 
 def _demo() -> tuple[WindowJob, Recording, Recording]:
@@ -141,7 +141,10 @@ def _monitor(
     from jaximp.live.monitor import Monitor
 
     columns, joints = columns_of(job.recording)
+    found = None if calibration is None else load_calibration(calibration)
     rate = job.recording.get("sample_rate") if sample_rate is None else sample_rate
+    if found is not None and not isinstance(rate, int | float):
+        rate = found.sample_rate
     sample_rate = float(rate) if isinstance(rate, int | float) else None
 
     def make(rate: float) -> Any:
@@ -149,23 +152,28 @@ def _monitor(
 
     if sample_rate is not None:
         make(sample_rate)
-    found = None if calibration is None else load_calibration(calibration)
-    state = None
+    state, resumes_at = None, float("nan")
     if found is not None and calibration is not None and sample_rate is not None:
-        state = load_state(calibration, live_of(make(sample_rate), found))
-    watch = Monitor(make, sample_rate=sample_rate, calibration=found, state=state, robot_alone=alone, **settings)
+        state, resumes_at = load_state(calibration, live_of(make(sample_rate), found))
+    watch = Monitor(
+        make,
+        sample_rate=sample_rate,
+        calibration=found,
+        state=state,
+        resumes_at=resumes_at,
+        robot_alone=alone,
+        **settings,
+    )
     return watch, columns, joints[0]
 
 
-def _source(
-    named: str, job: WindowJob, recording: Recording | None, speed: float, columns: Columns, token: str | None
-) -> Source:
+def _source(named: str, recording: Recording | None, speed: float, columns: Columns, token: str | None) -> Source:
     """What `--source` names."""
     from jaximp.live.sources import Piped, Replay
 
     kind, _, rest = named.replace("://", ":").partition(":")
-    if recording is not None or kind == "replay":
-        return Replay(job.load() if recording is None else recording, speed)
+    if recording is not None:
+        return Replay(recording, speed)
     if kind == "stdin":
         return Piped(sys.stdin.fileno(), columns)
     if kind in ("tcp", "udp"):

@@ -53,6 +53,8 @@ class Calibration:
     """Parameters of the robot that holds the joint; none without one."""
     seconds: float
     """How long the stretch was [s]."""
+    sample_rate: float
+    """[Hz]"""
     made_for: str
     """Model, filters and sample rate, in words: a calibration serves no others."""
 
@@ -123,7 +125,8 @@ def purpose(pipeline: Pipeline) -> str:
     names = ", ".join(pipeline.model.names)
     held = "" if pipeline.robot is None else f", held by a robot with {', '.join(pipeline.robot.names)}"
     filters = live_pipeline(pipeline).filter
-    parts = (f"{key}={value}" for key, value in vars(filters).items() if value is not None)
+    known = {key: value for key, value in vars(filters).items() if value is not None}
+    parts = (f"{key}={value:g}" if isinstance(value, float) else f"{key}={value}" for key, value in known.items())
     return f"{names}{held}; {pipeline.sample_rate:g} Hz; {', '.join(parts)}"
 
 
@@ -163,6 +166,7 @@ def calibrate(
         parameter_scale=np.asarray(moments(W, y, valid).parameter_scale),
         robot_theta=np.zeros(0) if theta is None else theta,
         seconds=seconds,
+        sample_rate=pipeline.sample_rate,
         made_for=made_for,
     )
 
@@ -241,7 +245,8 @@ def save_calibration(
     path = Path(path)
     frozen = calibration.frozen
     about = {
-        "format": FORMAT, "seconds": calibration.seconds, "made_for": calibration.made_for, "grid": frozen.grid,
+        "format": FORMAT, "seconds": calibration.seconds,
+        "sample_rate": calibration.sample_rate, "made_for": calibration.made_for, "grid": frozen.grid,
         "every": frozen.every, "jumps": frozen.jumps, "order": frozen.kind.order,
     }  # fmt: skip
     arrays: dict[str, Any] = {
@@ -286,17 +291,20 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         parameter_scale=arrays["parameter_scale"],
         robot_theta=arrays["robot_theta"],
         seconds=about["seconds"],
+        sample_rate=about["sample_rate"],
         made_for=about["made_for"],
     )
 
 
-def state_arrays(state: State) -> dict[str, Any]:
-    """A state as named arrays."""
-    return {f"state{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
+def state_arrays(state: State, resumes_at: float = math.nan) -> dict[str, Any]:
+    """A state as named arrays; `resumes_at` is when its next sample should come [s]."""
+    return {"resumes_at": np.array(resumes_at)} | {
+        f"state{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))
+    }
 
 
-def load_state(path: str | os.PathLike[str], live: Live) -> State | None:
-    """The state that stands beside a calibration; None where none was kept.
+def load_state(path: str | os.PathLike[str], live: Live) -> tuple[State | None, float]:
+    """The state that stands beside a calibration, None where none was kept; and when its next sample should come [s].
 
     **Raises:** `ValueError` for a state of another shape.
     """
@@ -304,14 +312,14 @@ def load_state(path: str | os.PathLike[str], live: Live) -> State | None:
     leaves, tree = jax.tree.flatten(empty)
     found = [arrays.get(f"state{k}") for k in range(len(leaves))]
     if found[0] is None:
-        return None
+        return None, math.nan
     if f"state{len(leaves)}" in arrays or any(
         one is None or one.shape != leaf.shape or one.dtype != leaf.dtype
         for one, leaf in zip(found, leaves, strict=True)
     ):
         raise ValueError(f"{path}: the state in it is that of other filters or another window: start without it")
     state: State = jax.tree.unflatten(tree, [jnp.asarray(one) for one in found])
-    return state
+    return state, float(arrays.get("resumes_at", math.nan))
 
 
 def _arrays(path: str | os.PathLike[str]) -> dict[str, Any]:

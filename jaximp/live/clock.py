@@ -20,6 +20,8 @@ FOLLOWS = 0.1
 """Share of a stamp's error by which the grid follows it: a clock that runs 1 % fast stays within a tenth of a step."""
 SET_BACK = 1.0
 """Seconds by which a sample can be late; one that is later comes from a clock that was set back."""
+PAUSE = 1.0
+"""Seconds without a sample that are an interruption."""
 IN_A_ROW = 0.1
 """As many seconds of late samples, one after the other, come from such a clock too."""
 
@@ -75,12 +77,15 @@ class Counts:
 class Clock:
     """The grid of one sample rate, from the first sample on."""
 
-    def __init__(self, sample_rate: float, flush: int):
-        """**Arguments:** `sample_rate` [Hz]; after so many missing samples (`flush`) all that was before is forgotten:
-        no longer gap need be filled."""
-        self.sample_rate, self.flush = sample_rate, flush
+    def __init__(self, sample_rate: float, flush: int, longest: int | None = None):
+        """**Arguments:** `sample_rate` [Hz]; after so many missing samples (`flush`) all that was before has left the
+        filters: as many part what a clock that was set anew has parted; the `longest` gap that is filled, by default as
+        many."""
+        self.sample_rate, self.flush, self.longest = sample_rate, flush, flush if longest is None else longest
         self.counts = Counts()
-        self._next, self._last, self._behind = math.nan, math.nan, 0
+        self.next = math.nan
+        """When the next sample should come [s]."""
+        self._last, self._behind = math.nan, 0
 
     def place(self, batch: Batch) -> Slots:
         """The places that a batch fills, with those that are missing before them."""
@@ -98,9 +103,9 @@ class Clock:
         if not math.isfinite(time):
             counts.not_finite += 1
             return
-        if math.isnan(self._next):
-            self._next = time
-        ahead = (time - self._next) * rate
+        if math.isnan(self.next):
+            self.next = time
+        ahead = (time - self.next) * rate
         if ahead < -HALF:
             self._behind += 1
             if -ahead <= SET_BACK * rate and self._behind < max(3, IN_A_ROW * rate):
@@ -109,22 +114,22 @@ class Clock:
                 return
             counts.clock_jumps += 1
             self._missed(found, self.flush)
-            self._next = time
+            self.next = time
         elif ahead > HALF:
             gone = round(ahead)
             counts.missing += gone
-            counts.interruptions += gone > self.flush
-            self._missed(found, min(gone, self.flush))
-            self._next = self._next + gone / rate if gone <= self.flush else time
+            counts.interruptions += gone > PAUSE * rate
+            self._missed(found, min(gone, self.longest))
+            self.next = self.next + gone / rate if gone <= self.longest else time
         self._behind, self._last = 0, time
-        self._next += 1 / rate + FOLLOWS * (time - self._next)
+        self.next += 1 / rate + FOLLOWS * (time - self.next)
         valid = math.isfinite(q) and math.isfinite(torque)
         counts.used += valid
         counts.not_finite += not valid
         found.append((time, q if valid else 0.0, torque if valid else 0.0, valid))
 
     def _missed(self, found: list[tuple[float, float, float, bool]], count: int) -> None:
-        found.extend((self._next + k / self.sample_rate, 0.0, 0.0, False) for k in range(count))
+        found.extend((self.next + k / self.sample_rate, 0.0, 0.0, False) for k in range(count))
 
 
 def rate_of(time: Numbers) -> float:

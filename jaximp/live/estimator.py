@@ -194,6 +194,10 @@ class Stepper:
         estimate: Estimate = self._unpack(np.asarray(found)[which])
         return estimate
 
+    def begin_anew(self) -> None:
+        """As before the first sample."""
+        self._state = _pack(init(self.live))
+
     @property
     def state(self) -> State:
         """As it is now."""
@@ -214,7 +218,7 @@ def _unpacker(tree: Any) -> Callable[[Any], Any]:
 
     def unpack(packed: Any) -> Any:
         several = packed.shape[:-1]
-        parts = [packed[..., a:b].reshape(*several, *shape).astype(kind) for a, b, shape, kind in pieces]
+        parts = [packed[..., a:b].reshape((*several, *shape)).astype(kind) for a, b, shape, kind in pieces]
         return jax.tree.unflatten(structure, parts)
 
     return unpack

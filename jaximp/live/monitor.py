@@ -20,7 +20,7 @@ from jaximp.live.calibration import Calibration, calibrate, live_of
 from jaximp.live.clock import Batch, Clock, Counts, Slots, rate_of
 from jaximp.live.estimator import CHUNKS, Estimate, State, Stepper, init
 from jaximp.live.front import Sample, front_of
-from jaximp.live.judging import ESTIMATES, PATH, WARMING_UP, judge_now
+from jaximp.live.judging import ESTIMATES, PATH, WARMING_UP, Judged, judge_now
 from jaximp.trust.verdicts import Verdict
 from jaximp.types import Numbers, Recording, nearest
 
@@ -30,6 +30,10 @@ UNTIL_RATE = 200
 """Samples from which the sample rate is told where nobody gave it."""
 MOST_WAITING = 2_000_000
 """Samples that wait for a calibration at most."""
+JUDGED_EVERY = 0.05
+"""Seconds for which a verdict holds, where updates come faster: words take longer than numbers."""
+FORGOTTEN = 30.0
+"""Seconds without a sample after which nothing is known of the parameters any more. In shorter pauses they drift on."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,7 @@ class Monitor:
         sample_rate: float | None = None,
         calibration: Calibration | None = None,
         state: State | None = None,
+        resumes_at: float = float("nan"),
         seconds: float = 20.0,
         robot_alone: Recording | None = None,
         estimate: str = PATH,
@@ -101,7 +106,8 @@ class Monitor:
         beside: bool = True,
     ):
         """**Arguments:** `make` the pipeline; `sample_rate` [Hz], told from the first stamps without it; a
-        `calibration`, or how many `seconds` of samples make one; with it a `state` to go on from; `robot_alone`, where
+        `calibration`, or how many `seconds` of samples make one; with it a `state` to go on from, and when
+        its next sample should come (`resumes_at`); `robot_alone`, where
         the pipeline has a robot; which `estimate` is shown (`track` or `window`); `every` so many seconds an update (0:
         with every sample); whether calibrations are made `beside` the samples, or in `feed`.
 
@@ -114,12 +120,14 @@ class Monitor:
         self.calibration = calibration
         self._make, self._given_state, self._seconds, self._robot_alone = make, state, seconds, robot_alone
         self._which, self._every, self._beside = estimate, every, beside
+        self._resumes_at = resumes_at
         self._first: list[Batch] = []
         self._waiting: list[Slots] = []
         self._job: Future[tuple[Calibration, Stepper]] | None = None
         self._pool: ThreadPoolExecutor | None = None
         self._stepper: Stepper | None = None
-        self._said = -np.inf
+        self._said = self._judged_at = -np.inf
+        self._judged: Judged | None = None
         self._failed = ""
         self.backlog = 0
         """Samples that wait."""
@@ -132,8 +140,9 @@ class Monitor:
     def _begin(self, sample_rate: float) -> None:
         pipeline = self.pipeline = self._make(sample_rate)
         front = front_of(pipeline, np.zeros(len(pipeline.robot.names)) if pipeline.robot is not None else None)
-        self._flush = front.derivatives.samples + front.bridge + 1
-        self.clock = Clock(sample_rate, self._flush)
+        reached = front.derivatives.samples + front.bridge + 1
+        self.clock = Clock(sample_rate, reached, max(reached, round(FORGOTTEN * sample_rate)))
+        self.clock.next = self._now = self._resumes_at
         self._late = front.late + front.causal.late
         if self.calibration is not None:
             self._stepper = _stepper(pipeline, self.calibration, self._given_state)
@@ -251,6 +260,18 @@ class Monitor:
     # ---- From then on.
 
     def _advance(self, slots: Slots) -> list[Update]:
+        """From one long pause to the next."""
+        found, first = [], 0
+        before = np.concatenate([[self._now], slots.time])
+        for last in (*np.flatnonzero(np.diff(before) > FORGOTTEN).tolist(), len(slots.time)):
+            found += self._follow(Slots(slots.time[first:last], Sample(*(x[first:last] for x in slots.sample))))
+            if last < len(slots.time) and self._stepper is not None:
+                self._stepper.begin_anew()
+            first = last
+        self._now = float(before[-1])
+        return found
+
+    def _follow(self, slots: Slots) -> list[Update]:
         assert self._stepper is not None
         q, torque, valid = slots.sample
         found, first = [], 0
@@ -279,8 +300,11 @@ class Monitor:
         assert pipeline is not None
         assert calibration is not None
         assert self._stepper is not None
-        window = self._stepper.live.window.length
-        judged = judge_now(pipeline, calibration, window, estimate, self._which, pipeline.limits)
+        judged = self._judged
+        if judged is None or not self._judged_at <= time < self._judged_at + JUDGED_EVERY:
+            window = self._stepper.live.window.length
+            judged = judge_now(pipeline, calibration, window, estimate, self._which, pipeline.limits)
+            self._judged, self._judged_at = judged, time
         of_path = self._which == PATH
         value, stderr, half = estimate.theta, estimate.stderr, NormalDist().inv_cdf(0.5 + LEVEL / 2)
         if not of_path:

@@ -21,7 +21,7 @@ PIPELINE = Pipeline(
     sample_rate=RATE,
     model=HumanJoint(),
     window=WindowSettings(length=1.0, step=0.1),
-    filter=FilterSettings(position_cutoff=25, decimation_cutoff=15),
+    filter=FilterSettings(position_cutoff=25.0, decimation_cutoff=15.0),
 )
 """Rows at 40 Hz."""
 
@@ -44,6 +44,7 @@ def calibration(jumps: bool = False, order: int = 0) -> Calibration:
         parameter_scale=theta,
         robot_theta=np.zeros(0),
         seconds=10.0,
+        sample_rate=RATE,
         made_for=purpose(PIPELINE),
     )
 

@@ -165,7 +165,8 @@ def test_a_state_goes_on_after_it_was_kept(tmp_path: Any, whole: tuple[bool, Sta
     middle = compiled_run(live(jumps), init(live(jumps)), some(samples(), 0, 600))[0]
     save_calibration(calibration(jumps), tmp_path / "kept.npz", state_arrays(middle))
     again = live_of(PIPELINE, load_calibration(tmp_path / "kept.npz"))
-    resumed = load_state(tmp_path / "kept.npz", again)
+    resumed, resumes_at = load_state(tmp_path / "kept.npz", again)
+    assert np.isnan(resumes_at)
     assert resumed is not None
     assert_same(compiled_run(again, resumed, some(samples(), 600, 1200))[0], state, rtol=0)
 
