@@ -183,6 +183,8 @@ def test_a_clock_that_jumps_goes_on(compiled: None) -> None:
     assert updates[-1].time < -900
 
 
+@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_state_is_as_large_after_ten_minutes_as_before(compiled: None) -> None:
     """120 000 samples: 10 min at 200 Hz."""
     watch = monitor(every=30.0)
