@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Annotated, Any
@@ -59,6 +60,12 @@ def monitor(
     ] = None,
     udp: Annotated[str | None, typer.Option("--udp", help="Send updates to HOST:PORT, too.")] = None,
     lsl: Annotated[str | None, typer.Option("--lsl", help="Open an outlet of this name for updates, too.")] = None,
+    page: Annotated[
+        str | None, typer.Option("--page", help="Show a live page at PORT (or HOST:PORT); 0 takes a free one.")
+    ] = None,
+    alarm: Annotated[
+        list[str] | None, typer.Option("--alarm", help="Such as 'stiffness > 80 for 2 s with 99 %'; may be repeated.")
+    ] = None,
     token: Annotated[
         str | None, typer.Option("--token", envvar="JAXIMP_TOKEN", help="What senders from elsewhere have to show.")
     ] = None,
@@ -89,12 +96,15 @@ def monitor(
     from jaximp.live.session import Session
 
     session = Session(reads, watch, sinks, kept, _say)
-    _run(session, seconds)
+    with _shown(session, page, token, alarm or [], job, joint):
+        _run(session, seconds)
     if save is not None and watch.calibration is not None and watch.state is not None and watch.clock is not None:
         save_calibration(watch.calibration, save, state_arrays(watch.state, watch.clock.next))
         _say(f"calibration and state: {save}")
     elif save is not None:
         _say("there is no calibration to save yet")
+    if session.report_wanted and log is not None:
+        _report(log)
 
 
 DEMO_CALIBRATES = 10.0
@@ -263,6 +273,64 @@ def _log(folder: Path, job: WindowJob, joint: str, alone: Recording | None) -> A
         save_recording(alone, folder / f"{alone.name}.csv")
         tables["robot_recording"]["file"] = f"{alone.name}.csv"
     return log
+
+
+@contextmanager
+def _shown(
+    session: Session, page: str | None, token: str | None, alarms: list[str], job: WindowJob, joint: str
+) -> Iterator[None]:
+    """With alarms, and a page where somebody asked for one."""
+    from jaximp.live.alarms import parse_rule
+
+    names = job.pipeline((joint,), ANY_RATE).model.names
+    session.watch([parse_rule(one, names) for one in alarms])
+    if page is None:
+        yield
+        return
+    from jaximp.live.page import Page
+    from jaximp.live.sinks import Aside
+    from jaximp.live.sockets import check_open
+
+    host, port = _address(page)
+    check_open(host, token)
+
+    def do(action: str, text: str) -> dict[str, Any]:
+        if action == "pause":
+            session.paused = not session.paused
+            return {"paused": session.paused}
+        if action == "mark":
+            session.mark(text or "mark")
+        if action == "report" and session.log is None:
+            return {"said": "there is no log to make a report of: start with --log DIR"}
+        if action in ("stop", "report"):
+            session.report_wanted = action == "report"
+            session.stop()
+        return {}
+
+    shown = Page(do, port, host, token, job.trust.min_excitation_ratio, lambda: {
+        "alarms": session.raised, "counts": session.status(),
+    })  # fmt: skip
+    _say(f"page: {shown.address}")
+    session.on_mark(shown.mark)
+    session.sinks = [*session.sinks, Aside(shown)]
+    yield
+    _say("the page is closed")
+
+
+ANY_RATE = 1e4
+"""At which the names of parameters are asked for [Hz]."""
+
+
+def _report(log: Path) -> None:
+    """What `identify` makes of the log."""
+    from jaximp.cli.identify import identify_into
+    from jaximp.cli.terminal import say_where
+    from jaximp.jobs.job import read_job
+    from jaximp.recordings.outputs import new_folder
+
+    with new_folder(log / "results") as folder:
+        identify_into(read_job(log / "job.toml"), folder)
+    say_where(log / "results")
 
 
 def _run(session: Session, seconds: float | None) -> None:

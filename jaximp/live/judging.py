@@ -12,8 +12,9 @@ from jaximp.identification.pipeline import Pipeline
 from jaximp.least_squares.window import SlidingFit
 from jaximp.live.calibration import Calibration
 from jaximp.live.estimator import Estimate
+from jaximp.models.base import Model
 from jaximp.trust.limits import TrustLimits
-from jaximp.trust.verdicts import POOR, TRUSTED, Rule, Verdict
+from jaximp.trust.verdicts import POOR, TRUSTED, WEAK, Rule, Verdict
 from jaximp.trust.window_rules import RULES, Windows, measure_windows
 from jaximp.types import AnyArray, Numbers
 
@@ -63,6 +64,8 @@ class Judged:
     """A verdict, and what the motion says of each parameter."""
 
     verdict: Verdict
+    advice: str
+    """Which motion is missing, where the verdict is that one is; else empty."""
     excitation: Numbers
     """(p,) how far each column rises above what noise of the position alone would build, in the trailing window."""
 
@@ -97,7 +100,25 @@ def judge_now(
     with np.errstate(divide="ignore", invalid="ignore"):
         by_noise = np.sqrt(float(window.samples)) * calibration.column_noise
         excitation = np.where(by_noise > 0, np.asarray(window.excitation) / by_noise, np.inf)
-    return Judged(_verdict(stream, limits), np.nan_to_num(excitation, nan=0.0, posinf=np.inf))
+    verdict = _verdict(stream, limits)
+    least = next((name for name in model.names if verdict.reason.startswith(f"{name}:")), model.names[0])
+    advice = _motion_for(model, least) if verdict.label == WEAK else ""
+    return Judged(verdict, advice, np.nan_to_num(excitation, nan=0.0, posinf=np.inf))
+
+
+MOTION_FOR = (
+    ("ddq", "accelerate more: turn round faster"),
+    ("sign(dq)", "move both ways, and faster than standstill"),
+    ("dq", "move faster"),
+    ("1", "hold other positions, or for longer"),
+    ("", "move farther"),
+)
+"""What to do for a parameter, by the column of the model that tells it: the first that fits."""
+
+
+def _motion_for(model: Model, name: str) -> str:
+    column = model.columns[model.names.index(name)] if name in model.names else ""
+    return next(words for start, words in MOTION_FOR if column.startswith(start))
 
 
 def _verdict(stream: Stream, limits: TrustLimits) -> Verdict:

@@ -59,6 +59,8 @@ class Update:
     """As `Estimate.surprise`."""
     excitation: Numbers | None = None
     """(p,) as `Judged.excitation`."""
+    advice: str = ""
+    """Which motion is missing, where one is."""
 
     def as_json(self) -> dict[str, Any]:
         """For a line of JSON; numbers that are not finite are null."""
@@ -74,6 +76,7 @@ class Update:
             "verdict": self.verdict.label,
             "reason": self.verdict.reason,
             "remedy": self.verdict.remedy,
+            "advice": self.advice,
             "parameters": parameters,
             "residual": _number(self.residual),
             "surprise": _number(self.surprise),
@@ -326,6 +329,7 @@ class Monitor:
             residual=float(estimate.window.residual_rms),
             surprise=float(estimate.surprise),
             excitation=judged.excitation,
+            advice=judged.advice,
         )
 
 

@@ -9,6 +9,7 @@ from threading import Event, Thread
 
 import numpy as np
 
+from jaximp.live.alarms import Alarm, Rule
 from jaximp.live.clock import Batch
 from jaximp.live.log import Log
 from jaximp.live.monitor import Monitor, Update
@@ -76,13 +77,37 @@ class Session:
         """**Arguments:** `say` takes lines for people, and `status_every` seconds a line on how it goes."""
         self.source, self.monitor, self.sinks, self.log, self.say = source, monitor, sinks, log, say
         self._status_every, self._stopped = status_every, Event()
+        self.paused, self.ignored, self.report_wanted = False, 0, False
+        """Whether samples are left out now, how many were, and whether somebody asked for the report."""
+        self._on_mark: list[Callable[[float, str], None]] = []
+        self._alarms: list[Alarm] = []
         self._waits = bool(getattr(source, "waits", False))
+        self._marks: queue.Queue[tuple[float, str]] = queue.Queue()
         self.most_backlog = 0
         """Samples that ever waited for the estimator."""
 
     def stop(self) -> None:
         """End soon; from any thread, or a signal."""
         self._stopped.set()
+
+    def mark(self, text: str) -> None:
+        """Note that something happened now."""
+        latest = self.monitor.latest
+        time = float("nan") if latest is None else latest.time
+        self._marks.put((time, text))
+
+    def watch(self, alarms: Sequence[Rule]) -> None:
+        """Raise alarms; they are said, and noted in the log."""
+        self._alarms += [Alarm(rule) for rule in alarms]
+
+    def on_mark(self, tell: Callable[[float, str], None]) -> None:
+        """Call this for every mark."""
+        self._on_mark.append(tell)
+
+    @property
+    def raised(self) -> list[str]:
+        """Alarms as they are now."""
+        return [alarm.rule.text for alarm in self._alarms if alarm.raised]
 
     def run(self) -> None:
         """Until the end; whatever ends it, the log is complete and the counts are said."""
@@ -95,7 +120,11 @@ class Session:
                 batches = pump.take()
                 now = time.monotonic()
                 samples = [one for one in batches if one is not None]
-                if samples:
+                self._note_marks()
+                if samples and self.paused:
+                    self.ignored += sum(len(one.time) for one in samples)
+                    last_sample = now
+                elif samples:
                     self._feed(Batch(*(np.concatenate(parts) for parts in zip(*samples, strict=True))))
                     last_sample, silent = now, self._say_back(silent)
                 elif not silent and now - last_sample > SILENT:
@@ -119,14 +148,30 @@ class Session:
         slots, updates = self.monitor.feed(batch)
         self.most_backlog = max(self.most_backlog, self.monitor.backlog)
         if self.log is not None:
-            self.log.add(slots, updates)
-        for sink in self.sinks:
-            for update in updates:
-                sink.put(update, self._waits)
+            self.log.add(slots, [])
+        self._hand_out(updates)
+
+    def _note_marks(self) -> None:
+        while not self._marks.empty():
+            time, text = self._marks.get()
+            if self.log is not None:
+                self.log.note(f"mark at {time:g} s: {text}")
+            for tell in self._on_mark:
+                tell(time, text)
+
+    def _look_for_alarms(self, update: Update) -> None:
+        for alarm in self._alarms:
+            if alarm.take(update):
+                line = f"alarm at {update.time:.2f} s: {alarm.rule.text}"
+                self.say(line)
+                if self.log is not None:
+                    self.log.note(line)
 
     def _hand_out(self, updates: list[Update]) -> None:
         if self.log is not None and updates:
             self.log.add(self.monitor.no_slots, updates)
+        for update in updates:
+            self._look_for_alarms(update)
         for sink in self.sinks:
             for update in updates:
                 sink.put(update, self._waits)
@@ -154,6 +199,7 @@ class Session:
         lost += self.source.lost
         overload = f"; {lost} samples lost: they came too fast" if lost else ""
         unreadable = f"; {self.source.unreadable} messages that could not be read" if self.source.unreadable else ""
+        overload += f"; {self.ignored} left out in pauses" if self.ignored else ""
         return counts.in_words() + overload + unreadable + late + verdict
 
     def _end(self, pump: _Pump) -> None:

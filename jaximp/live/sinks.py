@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from jaximp.live.monitor import Update
 
-MOST_WAITING = 200
+MOST_WAITING = 2000
 """Updates that wait for a slow reader."""
 PATIENCE = 2.0
 """Seconds that it has at the end."""
