@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from threading import Event, Thread
 
 import numpy as np
@@ -41,14 +42,21 @@ class _Pump(Thread):
                     self._hand_over(batch)
         except (OSError, ValueError) as error:
             self.error = str(error)
-        self._queue.put(None)
+        while not self.stop.is_set():
+            with suppress(queue.Full):
+                self._queue.put(None, timeout=TIMEOUT)
+                break
 
     def _hand_over(self, batch: Batch) -> None:
         waits = getattr(self._source, "waits", False)
-        try:
-            self._queue.put(batch, block=waits)
-        except queue.Full:
-            self.lost += len(batch.time)
+        while not self.stop.is_set():
+            try:
+                self._queue.put(batch, block=waits, timeout=TIMEOUT)
+            except queue.Full:
+                if waits:
+                    continue
+                self.lost += len(batch.time)
+            break
 
     def take(self) -> list[Batch | None]:
         """All that is there; waits a little for the first."""

@@ -84,6 +84,7 @@ class Iterated:
     """Whatever Python makes: an iterator of `(time, position, torque)`, each a number or equally long arrays."""
 
     lost = unreadable = 0
+    waits = True
 
     def __init__(self, samples: Iterable[tuple[Any, Any, Any]]):
         self._samples: Iterator[tuple[Any, Any, Any]] = iter(samples)

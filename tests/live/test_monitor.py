@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -16,17 +17,20 @@ import jax
 import numpy as np
 import pytest
 
-from factories.joints import TRUTH, joint
+from factories.joints import TRUTH, joint, sines
 from factories.live import PIPELINE, RATE, calibration, samples, some
 from factories.recordings import matches
 from jaximp.jobs.job import read_job
-from jaximp.live.calibration import calibrate, samples_of
+from jaximp.live.alarms import parse_rule
+from jaximp.live.calibration import calibrate, live_pipeline, robot_parameters, rows_of, samples_of
 from jaximp.live.clock import Batch, Slots
+from jaximp.live.front import front_of
 from jaximp.live.log import Log, toml_of
 from jaximp.live.monitor import Monitor, Update
 from jaximp.live.session import Session
 from jaximp.live.sinks import MOST_WAITING, Aside, Called, JsonLines, UdpSink
 from jaximp.live.sources import Iterated, Replay
+from jaximp.models.joint import RobotJoint
 from jaximp.trust.verdicts import NO_DATA, POOR, TRUSTED, WEAK, Verdict
 from jaximp.types import Recording
 
@@ -291,6 +295,93 @@ def test_a_session_stops_when_it_is_told_to(compiled: None, tmp_path: Path) -> N
     assert "samples received" in (tmp_path / "log" / "estimates.jsonl").read_text().splitlines()[-1]
 
 
+def test_what_comes_faster_than_it_is_worked_on_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaximp.live.session.MOST_BATCHES", 3)
+    busy, said = Event(), list[str]()
+
+    class Flood:
+        lost = unreadable = 0
+
+        def __init__(self) -> None:
+            self.pieces = 0
+
+        def read(self, timeout: float) -> Batch | None:
+            self.pieces += 1
+            if self.pieces > 20:
+                busy.set()
+                return None
+            return Batch(*np.full((3, 10), float(self.pieces)))
+
+        def close(self) -> None:
+            pass
+
+    watch = monitor()
+    feed, fed_so_far = watch.feed, []
+
+    def slowly(given: Batch) -> Any:
+        assert busy.wait(30)
+        fed_so_far.append(len(given.time))
+        return feed(given)
+
+    monkeypatch.setattr(watch, "feed", slowly)
+    Session(Flood(), watch, say=said.append).run()
+    lost = 200 - sum(fed_so_far)
+    assert lost > 0
+    assert f"{lost} samples lost: they came too fast" in said[-1]
+
+
+def test_pauses_marks_and_alarms(compiled: None, tmp_path: Path) -> None:
+    said, marked = list[str](), list[tuple[float, str]]()
+    log = Log(tmp_path / "log", {"model": {"human": True}})
+    pieces = batch(moving(9.0))
+
+    def source() -> Any:
+        for first in range(0, 1800, 50):
+            if first == 1200:
+                session.mark("pushed")
+            yield tuple(x[first : first + 50] for x in pieces)
+
+    session = Session(Iterated(source()), monitor(), log=log, say=said.append)
+    session.watch([parse_rule("stiffness > 15 for 1 s with 99 %", PIPELINE.model.names)])
+    session.on_mark(lambda time, text: marked.append((time, text)))
+    session.run()
+    assert session.raised == ["stiffness > 15 for 1 s with 99 %"]
+    assert sum(line.startswith("alarm at") for line in said) == 1
+    assert [text for _, text in marked] == ["pushed"]
+    notes = (tmp_path / "log" / "estimates.jsonl").read_text()
+    assert "pushed" in notes
+    assert "alarm at" in notes
+    again = Session(Iterated(source()), monitor(), say=said.append)
+    again.paused = True
+    session = again
+    again.run()
+    assert "1800 left out in pauses" in said[-1]
+
+
+# ---- A robot that holds the joint.
+
+
+def test_the_torque_of_a_robot_that_is_known_is_taken_off() -> None:
+    t = np.arange(1200) / RATE
+    _, dq, ddq = sines(t)
+    robot = RobotJoint(gravity=False, coulomb=False)
+    theta = np.array([0.7, 0.3])
+    of_robot = np.stack([dq, ddq], axis=1) @ theta
+    recording = replace(joint(t), torque=of_robot[:, None], name="robot_alone")
+    pair = replace(PIPELINE, robot=robot)
+    found = robot_parameters(live_pipeline(pair), recording)
+    np.testing.assert_allclose(found, theta, rtol=2e-3)
+    held = samples_of(joint(t, torque_noise=0.0))
+    with_robot = held._replace(torque=held.torque + of_robot)
+    W, y, valid = rows_of(front_of(live_pipeline(pair), theta), with_robot)
+    human, of_human, counts = rows_of(front_of(live_pipeline(PIPELINE)), held)
+    np.testing.assert_array_equal(valid, counts)
+    np.testing.assert_allclose(W, human)
+    np.testing.assert_allclose(y[valid], of_human[valid], rtol=2e-3, atol=2e-3 * np.abs(of_human[valid]).max())
+    with pytest.raises(ValueError, match=matches("needs the recording of the robot alone")):
+        robot_parameters(live_pipeline(pair), None)
+
+
 # ---- The log.
 
 JOB = """
@@ -340,6 +431,7 @@ import numpy as np
 from factories.joints import joint
 from jaximp.live.calibration import samples_of
 from jaximp.live.clock import Slots
+from jaximp.live.front import front_of
 from jaximp.live.log import Log
 log = Log(sys.argv[1], {"model": {"human": True}, "window": {"length": 1.0}})
 for k in range(10):
