@@ -14,6 +14,7 @@ from jaximp.live.clock import NOTHING, Batch
 from jaximp.recordings.channels import Signal
 from jaximp.recordings.mapping import given, joint_types, source_of
 from jaximp.recordings.units import to_si
+from jaximp.types import Numbers
 
 CHANNELS = ("time", "position", "torque")
 MOST_BYTES = 1 << 16
@@ -27,6 +28,8 @@ class Columns:
     name: Mapping[str, str | int] = field(default_factory=dict)
     """Of a channel, its column; channels may always go by their own names, in SI units."""
     factor: Mapping[str, float] = field(default_factory=dict)
+    sample_rate: float | None = None
+    """Of samples without a time [Hz], which are then counted."""
 
     def of(self, row: Mapping[str, Any], channel: str) -> tuple[Any, float]:
         """Its value and factor in a row.
@@ -55,9 +58,10 @@ def columns_of(table: Mapping[str, Any]) -> tuple[Columns, tuple[str, ...]]:
                 f"[recording] {channel}: a delay is not taken out live: set it to 0, or let the sender do so"
             )
         label = str(source.columns[0])
-        signal = to_si(channel, Signal((label,), np.ones((1, 1))), source, joints, table.get("gear_ratio", 1.0))
+        signal, _ = to_si(channel, Signal((label,), np.ones((1, 1))), source, joints, table.get("gear_ratio", 1.0))
         names[channel], factors[channel] = source.columns[0], float(signal.values[0, 0])
-    return Columns(names, factors), joints
+    rate = table.get("sample_rate")
+    return Columns(names, factors, float(rate) if isinstance(rate, int | float) else None), joints
 
 
 @dataclass
@@ -70,6 +74,7 @@ class LineReader:
     _rest: bytes = b""
     _header: list[str] | None = None
     _too_long: bool = False
+    _counted: int = 0
 
     def take(self, data: bytes) -> Batch:
         """Samples of all lines that are complete."""
@@ -110,28 +115,38 @@ class LineReader:
     def _of_json(self, line: bytes) -> tuple[Any, ...]:
         row = json.loads(line)
         parts = [np.atleast_1d(np.asarray(_numbers(value), float)) * factor for value, factor in self._channels(row)]
+        parts = self._with_time(parts)
         if any(part.ndim != 1 or len(part) != len(parts[0]) for part in parts):
             raise ValueError
         return tuple(parts)
 
     def _channels(self, row: Mapping[str, Any]) -> list[tuple[Any, float]]:
-        return [self.columns.of(row, channel) for channel in CHANNELS]
+        """Of time, position and torque; of the last two where time is to be counted."""
+        untimed = self.columns.sample_rate is not None and "time" not in row and "time" not in self.columns.name
+        return [self.columns.of(row, channel) for channel in CHANNELS[untimed:]]
+
+    def _with_time(self, parts: list[Numbers]) -> list[Numbers]:
+        if len(parts) == len(CHANNELS) or self.columns.sample_rate is None:
+            return parts
+        first, self._counted = self._counted, self._counted + len(parts[0])
+        return [np.arange(first, self._counted) / self.columns.sample_rate, *parts]
 
     def _of_csv(self, line: str) -> tuple[Any, ...] | None:
         delimiter = next((one for one in (";", "\t") if one in line), ",")
         fields = [one.strip() for one in next(csv.reader([line], delimiter=delimiter))]
         if not any(map(_is_number, fields)):
-            if not set(map(str, self.columns.name.values())) & set(fields) and not set(CHANNELS) <= set(fields):
+            if not set(map(str, self.columns.name.values())) & set(fields) and not set(CHANNELS[1:]) <= set(fields):
                 raise ValueError
             self._header = fields
             return None
         if self._header is not None:
             row: Mapping[str, Any] = dict(zip(self._header, fields, strict=True))
-        elif all(type(self.columns.name.get(channel)) is int for channel in CHANNELS):
+        elif self.columns.name and all(type(column) is int for column in self.columns.name.values()):
             row = {str(k + 1): one for k, one in enumerate(fields)}
         else:
-            row = dict(zip(CHANNELS, fields, strict=True))
-        return tuple(np.array([_number(value) * factor]) for value, factor in self._channels(row))
+            row = dict(zip(CHANNELS[len(fields) == 2 :], fields, strict=True))
+        parts = [np.array([_number(value) * factor]) for value, factor in self._channels(row)]
+        return tuple(self._with_time(parts))
 
 
 def _numbers(value: Any) -> Any:

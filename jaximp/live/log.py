@@ -17,7 +17,8 @@ import numpy as np
 from jaximp.live.clock import Slots
 from jaximp.live.monitor import Update
 from jaximp.recordings.outputs import MARK
-from jaximp.recordings.units import SUFFIXES, si_unit
+from jaximp.recordings.named_units import SUFFIXES
+from jaximp.recordings.units import si_unit
 
 EVERY = 1.0
 """Seconds between two writes."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import sosfilt, sosfilt_zi
 
 from factories.live import PIPELINE, RATE, calibration, live, samples, some
+from jaximp.identification.filter_settings import FilterSettings
 from jaximp.live.calibration import (
     live_of,
     live_pipeline,
@@ -230,3 +231,14 @@ def test_what_cannot_be_identified_live_is_refused_in_one_line(unchecked: None) 
         front_of(replace(PIPELINE, model=Joints(HumanJoint(), HumanJoint())))
     with pytest.raises(ValueError, match="another model, other filters or another sample rate"):
         live_of(replace(PIPELINE, sample_rate=2 * RATE), calibration())
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "order", "seconds"), [(10.0, 8, 0.514), (40.0, 8, 0.133), (40.0, 4, 0.071), (None, 8, 0.016)]
+)
+def test_the_delay_is_the_one_that_the_documentation_says(cutoff: float | None, order: int, seconds: float) -> None:
+    filters = FilterSettings(position_cutoff=cutoff, position_order=order)
+    front = front_of(replace(PIPELINE, sample_rate=1000.0, filter=filters))
+    assert front.late / 1000 == pytest.approx(seconds)
+    # An impulse comes out that much later, and not before.
+    assert front.late == np.abs(np.asarray(front.derivatives.taps)[0]).argmax() + front.bridge

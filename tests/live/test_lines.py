@@ -55,6 +55,22 @@ def test_numbered_columns_of_the_job() -> None:
     assert read(b"1,0.5,9,2\n", numbered) == ([[0.5, 1.0, 2.0]], 0)
 
 
+def test_samples_without_a_time_are_counted_where_the_job_gives_a_rate() -> None:
+    untimed = columns_of({"position": "q", "torque": "m", "sample_rate": 2})[0]
+    wanted = [[0.0, 1.0, 2.0], [0.5, 3.0, 4.0]]
+    for data in (
+        b"q,m\n1,2\n3,4\n",
+        b"1,2\n3,4\n",
+        b'{"q": [1, 3], "m": [2, 4]}\n',
+        b'{"q": 1, "m": 2}\n{"q": 3, "m": 4}\n',
+    ):
+        assert read(data, untimed) == (wanted, 0)
+    assert read(b'{"time": 7, "position": 1, "torque": 2}\n', untimed)[0] == [[7.0, 1.0, 2.0]]
+    reader = LineReader(Columns())
+    assert len(reader.take(b'{"position": 1, "torque": 2}\n').time) == 0
+    assert reader.unreadable == 1
+
+
 def test_no_number_is_nan() -> None:
     found, unreadable = read(b'{"time": 0.5, "position": null, "torque": 2}\n')
     np.testing.assert_array_equal(found, [[0.5, np.nan, 2]])
