@@ -1,9 +1,9 @@
 """`jaximp monitor` at 1 kHz for ten minutes: milliseconds from a sample to its estimate, and how many samples wait.
 
 A robot joint with five parameters, samples one by one. What a step takes is measured, and with it, for samples that
-come a millisecond apart, how many would wait; for a minute also with the verdict in words ten times a second. What other
-programs do to this stands beside it: the time of the processor that a step takes, which does not know them, and between
-the samples a loop of Python that takes about as long as a step and does the same each time.
+come a millisecond apart, how many would wait; for a minute also with the verdict in words ten times a second. What
+other programs do to this stands beside it: the time of the processor that a step takes, which does not know them, and
+between the samples a loop of Python that takes about as long as a step and does the same each time.
 Writes results/monitor.json and .md.
 
     python experiments/benchmarks/monitor.py

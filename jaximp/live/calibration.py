@@ -66,7 +66,11 @@ class Calibration:
             f"calibrated on {self.seconds:.3g} s: white noise of {self.frozen.torque_noise:.3g} N m in a row, after "
             f"autoregressions of order {self.filtered.order} (filters) and {self.noise.order} (what is left)"
         ]
-        how = ("as a random walk, {} {} in a second", "smoothly, its slope by {} {}/s in a second")[kind.order]
+        how = (
+            "as a random walk, {} {} in a second",
+            "smoothly, its slope by {} {}/s in a second",
+            "smoothly, the slope of its slope by {} {}/s^2 in a second",
+        )[kind.order]
         size = np.asarray(kind.size).mean(axis=0)
         each = (
             f"{name} {how.format(f'{one:.2g}', unit)}"
@@ -260,6 +264,8 @@ def save_calibration(
         "robot_theta": calibration.robot_theta,
     }
     arrays |= {f"kind.{name}": np.asarray(getattr(frozen.kind, name)) for name in KIND}
+    if frozen.kind.left is not None:
+        arrays["kind.left"] = np.asarray(frozen.kind.left)
     arrays |= {} if state is None else dict(state)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
     try:
@@ -281,7 +287,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """
     arrays = _arrays(path)
     about = json.loads(str(arrays["about"]))
-    kind = Kind(**{name: arrays[f"kind.{name}"] for name in KIND}, order=about["order"])
+    kind = Kind(**{name: arrays[f"kind.{name}"] for name in KIND}, order=about["order"], left=arrays.get("kind.left"))
     frozen = Frozen(arrays["torque_unit"], arrays["theta_unit"], kind, about["grid"], about["every"], about["jumps"])
     return Calibration(
         filtered=Autoregression(arrays["filtered"]),

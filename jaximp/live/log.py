@@ -16,8 +16,8 @@ import numpy as np
 
 from jaximp.live.clock import Slots
 from jaximp.live.monitor import Update
-from jaximp.recordings.outputs import MARK
 from jaximp.recordings.named_units import SUFFIXES
+from jaximp.recordings.outputs import MARK
 from jaximp.recordings.units import si_unit
 
 EVERY = 1.0

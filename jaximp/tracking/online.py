@@ -6,6 +6,7 @@ A stretch of rows tells how fast parameters move, how often they jump and how la
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from jaximp.tracking.blocks import compress
 from jaximp.tracking.causal import BANK, _Bank, _mixed, _split
 from jaximp.tracking.drift import NONE, step_of
 from jaximp.tracking.following import CAUSAL, Found, find
-from jaximp.tracking.paths import KINDS, _found
+from jaximp.tracking.paths import _found, kinds_of
 from jaximp.tracking.state_space import Motion, covariance_of, log_volume, moments, moved, start, with_rows
 from jaximp.types import AnyArray
 
@@ -45,13 +46,16 @@ class Kind(eqx.Module):
     size: Float[AnyArray, "L p"]
     """As `Drift.size`, to be shown."""
     order: int = eqx.field(static=True)
+    left: Float[AnyArray, "p L"] | None = None
+    """As in `Motion`."""
 
     @property
     def motion(self) -> Motion:
         """Without jumps, of which the bank takes care."""
         none = jnp.full((0, self.walk.shape[1]), NONE)
         walk, slope, memory = (jnp.asarray(x) for x in (self.walk, self.slope, self.memory))
-        return Motion(walk, slope, memory, none, none, self.order)
+        left = None if self.left is None else jnp.asarray(self.left)
+        return Motion(walk, slope, memory, none, none, self.order, left)
 
 
 class Frozen(eqx.Module):
@@ -120,8 +124,9 @@ def learn(
         raise ValueError(f"{valid.sum()} rows count, for {W.shape[1]} parameters: calibrate for longer, and move")
     blocks = _compress(W[:, None], y[:, None], valid[:, None], grid)
     sizes = np.full(W.shape[1], np.nan)
-    look = partial(find, sizes=sizes, jumps=jumps, apart=grid / row_rate, seed=seed)
-    by, fine, found = _found(blocks, sizes, lambda *scaled: [look(*scaled, order=kind) for kind in KINDS])
+    look = partial(find, sizes=sizes, jumps=jumps, apart=grid / row_rate, coefficients=(), seed=seed)
+    kinds = kinds_of(W.shape[1])
+    by, fine, found = _found(blocks, sizes, (), lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
     evidence = np.array([one.drawn.log_evidence for one in found])
     shares = np.exp(evidence - np.logaddexp.reduce(evidence))
     best = int(shares.argmax())
@@ -138,17 +143,18 @@ def _kind(found: Found, probability: float, points: int) -> Kind:
     search, drawn, lanes = found.search, found.drawn, found.drawn.some(CAUSAL)
     models = drawn.models.finer(found.every, np.zeros(drawn.models.at.shape, int))[lanes]
     rate = np.maximum(models.rate, 1 / points)
-    information = search.information / found.every
-    scale = drawn.scale[lanes]
-    step = step_of(rate, information[:, None], search.order)
-    walk, slope = (step**2, 0 * step) if search.order == 0 else (0 * step, step)
-    size = (step * np.sqrt(scale)).T / found.unit
-    return Kind(walk, slope, 1 / rate, scale, np.asarray(search.log_jump), np.asarray(probability), size, search.order)
+    information, scale = search.information / found.every, drawn.scale[lanes]
+    motion = jax.tree.map(np.asarray, replace(models, rate=rate).motion(information, search.order))
+    size = (step_of(rate, information[:, None], search.order) * np.sqrt(scale)).T / found.unit
+    log_jump, chance = np.asarray(search.log_jump), np.asarray(probability)
+    steps = motion.walk, motion.slope, motion.memory
+    return Kind(*steps, scale, log_jump, chance, size, search.order, motion.left)
 
 
 def begin_tracking(frozen: Frozen) -> Followers:
     """Before the first row: parameters are zero within a hundred times the size that the stretch suggested."""
-    p, bank = len(frozen.theta), BANK if frozen.jumps else 1
+    p = len(frozen.theta)
+    bank = max(BANK, 2 * p) if frozen.jumps else 1
     known = start(frozen.kind.motion)
     known = jnp.broadcast_to(known[:, :, None], (*known.shape[:2], bank, known.shape[2]))
     one = jnp.where(jnp.arange(bank) == 0, 0.0, -1e6)[:, None] + jnp.zeros(known.shape[-1])

@@ -99,7 +99,7 @@ def track(
         raise ValueError(f"drift has shape {sizes.shape}: give {p} numbers from zero up, NaN for what is to be found")
     if order not in (None, *ORDERS):
         raise ValueError(f"order is {order}: give 0, 1 or 2, how often a random walk is integrated, or None")
-    kinds = ((0, 2) if p <= FEW else (0, 1)) if order is None else (order,)
+    kinds = kinds_of(p) if order is None else (order,)
     coefficients = () if curves is None else curves.coefficients
     look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, coefficients=coefficients, seed=seed)
     by, fine, found = _found(
@@ -107,6 +107,11 @@ def track(
     )
     time = _middles(len(blocks.rows), step, every, samples) / rate
     return _averaged(fine, by, found, curves, step * every, time, named, sample_rate is not None, seed)
+
+
+def kinds_of(p: int) -> tuple[int, ...]:
+    """How often random walks are integrated that p parameters may do: the kinds of motion that are weighed."""
+    return (0, 2) if p <= FEW else (0, 1)
 
 
 def smoothed_path(
