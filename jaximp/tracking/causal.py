@@ -31,7 +31,7 @@ BANK = 32
 """Filters of each model, at least."""
 
 
-class _Bank(NamedTuple):
+class Bank(NamedTuple):
     known: Float[Array, "d e H L"]
     evidence: Float[Array, "H L"]
     """Of each filter, but for what it knows at present."""
@@ -59,23 +59,23 @@ def filtered(
     known = jnp.broadcast_to(known[:, :, None], (*known.shape[:2], bank, known.shape[2]))
     one = jnp.where(jnp.arange(bank) == 0, 0.0, -1e6)[:, None] + jnp.zeros_like(scale)
 
-    def step(at: _Bank, now: tuple[Array, Array, Any]) -> tuple[_Bank, tuple[Array, Array]]:
+    def step(at: Bank, now: tuple[Array, Array, Any]) -> tuple[Bank, tuple[Array, Array]]:
         k, block, curve = now
         before, less = moved(at.known, wide, jnp.zeros_like(wide.walk))
         at = at._replace(known=before, evidence=at.evidence + less / 2)
         if len(moving):
-            at = jax.lax.cond(k % every == 0, lambda at: _split(at, moving, log_jump), lambda at: at, at)
+            at = jax.lax.cond(k % every == 0, lambda at: split(at, moving, log_jump), lambda at: at, at)
         known, left = with_rows(at.known, wide.of_lanes(block))
         evidence = at.evidence - left / (2 * scale)
         log_weight = evidence - log_volume(known)
         theta, root = seen(known[-f:, -f - 1 :], wide, curve)
         weight = jax.nn.softmax(log_weight, axis=0)
-        return _Bank(known, evidence, log_weight), _mixed(theta, covariance_of(root) * scale, weight)
+        return Bank(known, evidence, log_weight), over_filters(theta, covariance_of(root) * scale, weight)
 
-    return jax.lax.scan(step, _Bank(known, one, one), (jnp.arange(points), rows, curves))[1]
+    return jax.lax.scan(step, Bank(known, one, one), (jnp.arange(points), rows, curves))[1]
 
 
-def _mixed(
+def over_filters(
     theta: Float[Array, "p H L"], covariance: Float[Array, "p p H L"], weight: Float[Array, "H L"]
 ) -> tuple[Float[Array, "p L"], Float[Array, "p p L"]]:
     """Mean and covariance over the filters of each model."""
@@ -84,7 +84,7 @@ def _mixed(
     return mean, (weight * (covariance + apart[:, None] * apart)).sum(axis=2)
 
 
-def _split(at: _Bank, moving: Array, log_jump: Array) -> _Bank:
+def split(at: Bank, moving: Array, log_jump: Array) -> Bank:
     """The most probable filter, with a jump of each parameter, in the place of the least probable ones."""
     known, evidence, log_weight = at
     p, d, lanes = len(moving), len(known), jnp.arange(evidence.shape[1])
@@ -92,7 +92,7 @@ def _split(at: _Bank, moving: Array, log_jump: Array) -> _Bank:
     parent = known[:, :, best, lanes]
     child, less = widened(parent[:, :, None], parent[:, d - p : d], jnp.asarray(moving, known.dtype)[:, None])
     gone = log_jump + jnp.where(moving[:, None], less / 2, -1e6)
-    return _Bank(
+    return Bank(
         known.at[:, :, *place].set(child),
         evidence.at[place].set(evidence[best, lanes] + gone),
         log_weight.at[place].set(log_weight[best, lanes] + gone),

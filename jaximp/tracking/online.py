@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, Shaped
 
 from jaximp.tracking.blocks import compress
-from jaximp.tracking.causal import BANK, _Bank, _mixed, _split
+from jaximp.tracking.causal import BANK, Bank, over_filters, split
 from jaximp.tracking.drift import NONE, step_of
 from jaximp.tracking.following import CAUSAL, Found, find
-from jaximp.tracking.paths import _found, kinds_of
+from jaximp.tracking.paths import found_in, kinds_of
 from jaximp.tracking.state_space import Motion, covariance_of, log_volume, moments, moved, start, with_rows
 from jaximp.types import AnyArray
 
@@ -83,7 +83,7 @@ class Frozen(eqx.Module):
 class Followers(NamedTuple):
     """The bank, and what it says."""
 
-    bank: _Bank
+    bank: Bank
     points: Int[Array, ""]
     """So far."""
     rows: Float[Array, "g f"]
@@ -126,7 +126,7 @@ def learn(
     sizes = np.full(W.shape[1], np.nan)
     look = partial(find, sizes=sizes, jumps=jumps, apart=grid / row_rate, coefficients=(), seed=seed)
     kinds = kinds_of(W.shape[1])
-    by, fine, found = _found(blocks, sizes, (), lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
+    by, fine, found = found_in(blocks, sizes, (), lambda *scaled: [look(*scaled, order=kind) for kind in kinds])
     evidence = np.array([one.drawn.log_evidence for one in found])
     shares = np.exp(evidence - np.logaddexp.reduce(evidence))
     best = int(shares.argmax())
@@ -160,7 +160,7 @@ def begin_tracking(frozen: Frozen) -> Followers:
     one = jnp.where(jnp.arange(bank) == 0, 0.0, -1e6)[:, None] + jnp.zeros(known.shape[-1])
     nothing, count = jnp.zeros(()), jnp.zeros((), int)
     unknown = jnp.full(p, jnp.nan), jnp.full((p, p), jnp.nan)
-    return Followers(_Bank(known, one, one), count, jnp.zeros((frozen.grid, p + 1)), count, *unknown, nothing, nothing)
+    return Followers(Bank(known, one, one), count, jnp.zeros((frozen.grid, p + 1)), count, *unknown, nothing, nothing)
 
 
 def track_row(frozen: Frozen, at: Followers, row: Float[Array, " f"], valid: Array) -> tuple[Followers, Array]:
@@ -188,8 +188,8 @@ def _next_point(frozen: Frozen, at: Followers) -> Followers:
 
 
 def _advanced(
-    frozen: Frozen, bank: _Bank, rows: Float[Array, "g f"], point: Array
-) -> tuple[_Bank, Float[Array, " p"], Float[Array, "p p"], Array]:
+    frozen: Frozen, bank: Bank, rows: Float[Array, "g f"], point: Array
+) -> tuple[Bank, Float[Array, " p"], Float[Array, "p p"], Array]:
     """One step of `causal.filtered`: the bank, mean and covariance over all its models, and the square of what the rows
     say that was not expected."""
     kind, p = frozen.kind, len(frozen.theta)
@@ -198,17 +198,17 @@ def _advanced(
     before, less = moved(bank.known, wide, jnp.zeros_like(wide.walk))
     bank = bank._replace(known=before, evidence=bank.evidence + less / 2)
     if frozen.jumps:
-        split = partial(_split, moving=jnp.ones(p, bool), log_jump=jnp.asarray(kind.log_jump))
-        bank = jax.lax.cond(point % frozen.every == 0, split, lambda bank: bank, bank)
+        after_split = partial(split, moving=jnp.ones(p, bool), log_jump=jnp.asarray(kind.log_jump))
+        bank = jax.lax.cond(point % frozen.every == 0, after_split, lambda bank: bank, bank)
     expected = jax.nn.softmax(bank.evidence - log_volume(bank.known), axis=0)
     known, left = with_rows(bank.known, rows)
     evidence = bank.evidence - left / (2 * scale)
     log_weight = evidence - log_volume(known)
     theta, root = moments(known[-p:, -p - 1 :])
-    mean, covariance = _mixed(theta, covariance_of(root) * scale, jax.nn.softmax(log_weight, axis=0))
+    mean, covariance = over_filters(theta, covariance_of(root) * scale, jax.nn.softmax(log_weight, axis=0))
     # Logarithms that grow for hours would lose their digits.
     largest = log_weight.max(axis=0)
-    bank = _Bank(known, evidence - largest, log_weight - largest)
+    bank = Bank(known, evidence - largest, log_weight - largest)
     surprise = (expected * left).sum(axis=0) / scale
     theta = mean.mean(axis=1)
     apart = mean - theta[:, None]

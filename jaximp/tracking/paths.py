@@ -102,7 +102,7 @@ def track(
     kinds = kinds_of(p) if order is None else (order,)
     coefficients = () if curves is None else curves.coefficients
     look = partial(find, sizes=sizes, jumps=jumps, apart=step * every / rate, coefficients=coefficients, seed=seed)
-    by, fine, found = _found(
+    by, fine, found = found_in(
         blocks, sizes, () if curves is None else curves.owners, lambda *scaled: [look(*scaled, order=k) for k in kinds]
     )
     time = _middles(len(blocks.rows), step, every, samples) / rate
@@ -186,7 +186,7 @@ def _side_by_side(
     return Path(theta, covariance), found.log_determinant - found.squares / 2 - log_noise
 
 
-def _found(
+def found_in(
     blocks: Blocks, sizes: Numbers, owners: tuple[int, ...], look: Callable[[Blocks, Scales], list[Found]]
 ) -> tuple[Scales, Blocks, list[Found]]:
     """Models of all kinds, in scales of the record. Sizes that are given are no multiples of the noise: where there are
