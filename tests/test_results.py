@@ -15,7 +15,7 @@ from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import parse_job
 from jaximp.jobs.run import identify_recording, infer_recording
 from jaximp.posterior.inference import Inference
-from jaximp.reports.estimates import estimates_table
+from jaximp.reports.contents import estimates_table
 from jaximp.results import Result
 
 

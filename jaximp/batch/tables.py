@@ -19,7 +19,7 @@ from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Joints, Model
 from jaximp.models.reflex import pathway_of
-from jaximp.reports.estimates import estimates_table, sums_of
+from jaximp.reports.contents import estimates_table, sums_of
 from jaximp.reports.pages import table_of, versions
 from jaximp.trust.verdicts import VERDICTS
 
