@@ -90,7 +90,7 @@ def init(live: Live) -> State:
 
 
 def step(live: Live, state: State, sample: Sample) -> tuple[State, Estimate]:
-    """One sample further. Pure; a compiled one comes from `compiled_step`.
+    """One sample further. Pure: `jit` goes through; a loop of Python is served by `Stepper`.
 
     **Arguments:** `sample` position [rad or m] and torque [N m or N] at the next instant of the grid, or a missing one.
     """
