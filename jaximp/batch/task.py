@@ -148,7 +148,7 @@ def joints_of(job: WindowJob, items: Sequence[Item]) -> int:
     for item in items if named == 1 else ():
         if item.file.suffix.lower() not in MATRICES:
             return named
-        with suppress(ValueError, OSError):
+        with suppress(ValueError, OSError, MemoryError):
             return load(job.recording, item.file, job.folder).n_joints
     return named
 
