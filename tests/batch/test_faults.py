@@ -282,7 +282,7 @@ def test_what_fails_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert events[-1]["failed"] == 5
     reasons = {one["recording"]: one["reason"] for one in json.loads((tmp_path / "batch/quarantine.json").read_text())}
     assert set(reasons) == {"bad.csv", "cut.parquet", "short.parquet", "link.parquet", "pipe.parquet"}
-    assert reasons["bad.csv"].startswith("column 'torque_Nm', row 1: 'x' is not a number")
+    assert "column 'torque_Nm', row 1: 'x' is not a number" in reasons["bad.csv"]
     assert "symbolic links" in reasons["link.parquet"]
     assert "no plain file" in reasons["pipe.parquet"]
     table = batch.read_recordings(tmp_path / "batch")
