@@ -503,7 +503,7 @@ def unnoticed(
     shares = ERRORS * np.array([one.stderr for one in misfits]) / size
     worst = misfits[int(np.argmax(shares.max(axis=1)))]
     most = {name: float(part) for name, part in zip(names, shares.max(axis=0), strict=True) if part > SHARE}
-    blinded = largest_of(most, lambda name, part: f"{name} by {part:.0%}")
+    blinded = largest_of(most, lambda name, part: f"{name} by {_share(part)}")
     said = [_unnoticed_delay(misfits, size, kinds)]
     said += [f"{what(worst.group)}, say, could move {', '.join(blinded)} unnoticed"] if blinded else []
     return f"this motion cannot show everything: {'; '.join(filter(None, said))}" if any(said) else ""
@@ -529,5 +529,10 @@ def _unnoticed_delay(misfits: Sequence[Misfit], size: Numbers, kinds: Sequence[s
     if not owner(group) and np.isfinite([of.get(kind, np.inf) for kind in ("damping", "stiffness")]).all():
         hidden = late[group] * of["stiffness"] / (2 * of["damping"])
         if hidden > SHARE:
-            text += f", and so would what yields as much and hides up to {hidden:.0%} of the stiffness"
+            whole = f"up to {hidden:.0%} of the stiffness" if hidden < 1 else "all of the stiffness"
+            text += f", and so would what yields as much and hides {whole}"
     return text
+
+
+def _share(part: float) -> str:
+    return f"{part:.0%}" if part < 1 else "more than itself"

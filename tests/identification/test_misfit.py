@@ -183,6 +183,15 @@ def test_the_delay_that_would_go_unnoticed_is_said_with_what_yields_as_much() ->
     assert "would go" not in unnoticed([robots], kinds, size, kinds)
 
 
+def test_what_could_hide_more_than_all_is_not_told_in_thousands_of_per_cent() -> None:
+    kinds = ["inertia", "damping", "stiffness"]
+    late = found("delay", [0.0, 0.0, 0.0], [0.5, 0.05, 0.0])
+    late = replace(late, weights_stderr=np.array([0.015]))  # 1 s
+    text = unnoticed([late], kinds, np.array([0.015, 0.7, 60.0]), kinds)
+    assert "hides all of the stiffness" in text
+    assert "inertia by more than itself" in text
+
+
 def test_weights_of_a_reflex_are_not_named_one_by_one() -> None:
     names = ["inertia", "weight at 0.04 s", "weight at 0.07 s"]
     lag = found("lag", [0.0, 0.0, 0.0], [0.1, 5.0, 5.0])
