@@ -20,6 +20,7 @@ def demo(out: Out = Path("jaximp-demo"), force: Force = False, seed: Seed = 0) -
         with bar_of("simulating") as progress:
             write_ankle_recording(folder, seed)
             progress(1.0)
-        identify_into(read_job(folder / "job.toml"), folder)
+        say = identify_into(read_job(folder / "job.toml"), folder)
+    say()
     typer.echo(f"the truth: {'; '.join(truth_in_words())}")
     say_where(out)

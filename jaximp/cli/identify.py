@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
@@ -36,16 +37,17 @@ def identify(job_file: JobFile, out: OutBeside = None, force: Force = False) -> 
         typer.echo(job.text)
     out = out_beside(job_file, out, "results")
     with new_folder(out, force, inputs=[job_file, *job.files()]) as folder:
-        identify_into(job, folder)
+        say = identify_into(job, folder)
+    say()
     say_where(out)
 
 
-def identify_into(job: Job, folder: Path) -> None:
+def identify_into(job: Job, folder: Path) -> Callable[[], None]:
+    """Write all results, and return what says them: a terminal that is gone by then must not take the folder along."""
     from jaximp.jobs.job import TrialsJob
 
     if isinstance(job, TrialsJob):
-        _identify_trials_into(job, folder)
-        return
+        return _identify_trials_into(job, folder)
     from jaximp.identification.identify import at_other_lengths, in_windows, longest_of
     from jaximp.jobs.run import CHOSEN, complete, load_pair, prepare, weigh
 
@@ -66,11 +68,15 @@ def identify_into(job: Job, folder: Path) -> None:
         progress(0.9)
         write_results(folder, estimates, lengths, job, prepared.recording, found)
         progress(1.0)
-    for note in (note for note in recording.notes if note.startswith(CHOSEN)):
-        typer.echo(note)
-    _say_result(estimates[0])
-    for line in [] if found is None else found.in_words():
-        typer.echo(line)
+
+    def say() -> None:
+        for note in (note for note in recording.notes if note.startswith(CHOSEN)):
+            typer.echo(note)
+        _say_result(estimates[0])
+        for line in [] if found is None else found.in_words():
+            typer.echo(line)
+
+    return say
 
 
 def _how_loose(estimates: Estimates, share: float) -> str:
@@ -85,7 +91,7 @@ def _how_loose(estimates: Estimates, share: float) -> str:
     return f": its standard error in one {estimates.kind} is {times}"
 
 
-def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
+def _identify_trials_into(job: TrialsJob, folder: Path) -> Callable[[], None]:
     from jaximp.jobs.run_trials import identify_trials
 
     Thread(target=import_module, args=("jaximp.reports.impedance",)).start()
@@ -95,10 +101,14 @@ def _identify_trials_into(job: TrialsJob, folder: Path) -> None:
 
         write_trials_results(folder, result, job)
         progress(1.0)
-    for estimate in result.estimates:
-        _say_impedance(estimate)
-    for note in result.notes:
-        typer.echo(f"note: {note}")
+
+    def say() -> None:
+        for estimate in result.estimates:
+            _say_impedance(estimate)
+        for note in result.notes:
+            typer.echo(f"note: {note}")
+
+    return say
 
 
 def _say_result(estimates: Estimates) -> None:

@@ -329,7 +329,8 @@ def _report(log: Path) -> None:
     from jaximp.recordings.outputs import new_folder
 
     with new_folder(log / "results") as folder:
-        identify_into(read_job(log / "job.toml"), folder)
+        say = identify_into(read_job(log / "job.toml"), folder)
+    say()
     say_where(log / "results")
 
 

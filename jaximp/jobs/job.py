@@ -580,7 +580,8 @@ def _check_gears(job: WindowJob) -> None:
         raise ValueError(
             f"model.robot and model.human have different gear ratios, {sorted(ratios)}: they share one motor"
         )
-    if ratios != {1.0} and job.recording.get("gear_ratio", 1.0) != 1.0:
+    geared = ratios - {1.0} or (job.model.chain is not None and job.model.chain.gear != 1.0)
+    if geared and job.recording.get("gear_ratio", 1.0) != 1.0:
         raise ValueError(
             "gear_ratio stands both in [recording], which brings the columns to the joint, and in [model], which "
             "expects them at the motor: keep one of them"

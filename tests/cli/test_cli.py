@@ -1,7 +1,10 @@
 """The command line as a person meets it: exit status, one line for bad input, nothing half-written."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +117,25 @@ def test_demo_finds_the_step(run, tmp_path: Path) -> None:  # type: ignore[no-un
     for value, when in zip(truth["stiffness"], (before, after), strict=True):
         assert np.abs((stiffness - value) / stderr)[when].max() < 4
         np.testing.assert_allclose(stiffness[when].mean(), value, rtol=0.03)
+
+
+def test_a_reader_that_leaves_takes_no_results_along(job: Path) -> None:
+    """As `| head -0` does."""
+    out = job.parent / "out"
+    read, write = os.pipe()
+    os.close(read)
+    command = [
+        sys.executable,
+        "-c",
+        "from jaximp.cli.main import main; main()",
+        "identify",
+        str(job),
+        "--out",
+        str(out),
+    ]
+    subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=300, check=False)
+    os.close(write)
+    assert (out / "estimates.parquet").is_file()
 
 
 @pytest.mark.slow

@@ -52,6 +52,13 @@ def job_of(text: str, folder: Path) -> WindowJob:
     return job
 
 
+def test_a_gear_stands_in_the_recording_or_in_the_model(folder: Path) -> None:
+    geared = JOB.replace("[model.robot]", "gear_ratio = 15\n[model.robot]")
+    assert job_of(geared, folder).recording["gear_ratio"] == 15
+    with pytest.raises(ValueError, match="keep one of them"):
+        job_of(geared.replace("friction = true", "friction = true\ngear = 15.0"), folder)
+
+
 @pytest.mark.slow  # compiles the programs of two lengths, and draws a report
 def test_a_job_leads_to_a_report(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "out"
