@@ -21,7 +21,7 @@ install_import_hook("jaximp", "shapes.checked")
 pytest.register_assert_rewrite("factories")
 
 CHOSEN = "JAX_DISABLE_MOST_OPTIMIZATIONS" in os.environ
-STORE, KEPT = pytest.StashKey[Path](), pytest.StashKey[int]()
+STORE, KEPT, PLAIN = pytest.StashKey[Path](), pytest.StashKey[int](), pytest.StashKey[bool]()
 MUCH_MEMORY, MOST_MEMORY, MORE_MEMORY = 1_500_000_000, 2_300_000_000, 600_000_000
 """Of one process [bytes]: compilers leave it full of holes, which are given back from here on, and programs with it;
 these again when so much has come on top of what was left."""
@@ -51,8 +51,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         return
     marked = {marker.name for marker in item.iter_markers()}
     quick = "optimised" not in marked and ("slow" not in marked or "compiles" in marked)
-    if item.get_closest_marker("optimised") and jax.config.read("jax_disable_most_optimizations"):
+    stash = item.config.stash
+    if "optimised" in marked and stash.get(PLAIN, False):  # whatever ran in between
         jax.clear_caches()
+        stash[PLAIN] = False
+    stash[PLAIN] = stash.get(PLAIN, False) or quick
     jax.config.update("jax_disable_most_optimizations", quick)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # for processes that tests start
 

@@ -199,7 +199,7 @@ def load_trial_table(path: str | os.PathLike[str], trial: str = "trial", **mappi
         with _named(f"{path}, trial {number:g}"):
             part = {key: replace(signal, values=signal.values[rows]) for key, signal in signals.items()} | scalar
             name = f"{_stem(path)}, trial {number:g}"
-        recordings.append(assemble(take_clock(part, rate), part, joints, name, notes, mapping.get("duplicates")))
+            recordings.append(assemble(take_clock(part, rate), part, joints, name, notes, mapping.get("duplicates")))
     return recordings
 
 

@@ -16,6 +16,14 @@ from factories.studies import content, run
 from jaximp.batch import workers as batch_workers
 
 
+@pytest.fixture(scope="module")
+def alone(study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The study by this process alone, with the programs that other processes have: those of users."""
+    out = tmp_path_factory.mktemp("alone") / "out"
+    run(study, out)
+    return out
+
+
 @pytest.mark.slow
 def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> None:
     """Two devices, which XLA makes of one processor, give what one gives, and each has half of the recordings."""
@@ -46,7 +54,8 @@ def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: Path) -> None:
+@pytest.mark.optimised
+def test_workers_give_the_same_bits_though_one_is_killed(study: Path, alone: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     import psutil
 
@@ -64,18 +73,19 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, tmp_path: 
 
     assert run(study, tmp_path / "out", workers=2, tell=kill).exit_status == 0
     assert killed
-    assert content(tmp_path / "out") == content(study / "reference")
+    assert content(tmp_path / "out") == content(alone)
     assert json.loads((tmp_path / "out/quarantine.json").read_text()) == []
 
 
 @pytest.mark.slow
-def test_somebodys_cluster_gives_the_same(study: Path, tmp_path: Path) -> None:
+@pytest.mark.optimised
+def test_somebodys_cluster_gives_the_same(study: Path, alone: Path, tmp_path: Path) -> None:
     """Workers that know nothing of us, but for where we are installed."""
     distributed = pytest.importorskip("distributed")
     options = {"host": "127.0.0.1", "dashboard_address": None, "worker_dashboard_address": None, "silence_logs": 50}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, **options) as cluster:
         assert run(study, tmp_path / "out", scheduler=cluster.scheduler_address).exit_status == 0
-    assert content(tmp_path / "out") == content(study / "reference")
+    assert content(tmp_path / "out") == content(alone)
 
 
 def test_who_cannot_work_is_said_in_a_line(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

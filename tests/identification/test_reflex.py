@@ -312,7 +312,7 @@ def test_the_other_direction_is_told_by_the_sign_of_the_gain_and_by_what_is_pred
 
 @pytest.mark.slow
 def test_windows_are_those_of_numpy_and_the_gain_has_its_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("jaximp.identification.judging._corrected", lambda prepared, rows, fit, place: fit)
+    monkeypatch.setattr("jaximp.identification.judging._corrected", lambda prepared, rows, fit, *others: fit)
     job = parse_job(JOB)
     prepared = prepare(job.pipeline_for(joint()), joint())
     estimates = in_windows(prepared)[0]

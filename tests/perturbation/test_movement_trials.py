@@ -144,7 +144,7 @@ def test_trials_of_a_table_may_restart_or_run_on(tmp_path: Path, recorded: list[
 
 def test_trial_table_names_its_trial(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(
-        "n,t,q,f\n" + "".join(f"{k},{i},{i % 3},{i % 2}\n" for k in (1, 5) for i in (0, 1, 1))
+        "n,t,q,f\n" + "".join(f"{k},{t},{i},{i % 2}\n" for k in (1, 5) for i, t in enumerate((0, 1, 1, 2)))
     )
     columns: dict[str, Any] = {"time": "t", "position": "q", "torque": "f"}
     with pytest.raises(ValueError, match=r"t\.csv, trial 1: 't', row 3.*repeats"):
