@@ -252,8 +252,7 @@ class Estimates(Result):
         ]
 
     def _columns_of_path(self) -> list[Column]:
-        """Where parameters were followed: what was known up to each point, and how probable a jump in front of it is.
-        Other parts of a table stand for the whole record."""
+        """Where parameters were followed: what was known up to each point, and how probable a jump before it is."""
         columns, k = [], 0
         for track in self.tracks:
             theta, stderr = np.asarray(track.filtered.theta), np.asarray(track.filtered.stderr)

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from jaximp.least_squares.window import least_squares
 from jaximp.live.estimator import Live, State, compiled_rows, init
 from jaximp.live.front import Front, Sample, front_of, nothing_held
 from jaximp.numerics.precision import require_float64
+from jaximp.recordings.outputs import write_whole
 from jaximp.tracking.online import Frozen, Kind, learn
 from jaximp.types import Numbers, Recording
 
@@ -267,13 +269,9 @@ def save_calibration(
     if frozen.kind.left is not None:
         arrays["kind.left"] = np.asarray(frozen.kind.left)
     arrays |= {} if state is None else dict(state)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
-    try:
-        with unfinished.open("wb") as file:
-            np.savez(file, **arrays)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    content = BytesIO()
+    np.savez(content, **arrays)
+    write_whole(path, content.getvalue())
 
 
 KIND = ("walk", "slope", "memory", "scale", "log_jump", "probability", "size")

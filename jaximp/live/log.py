@@ -7,7 +7,6 @@ Samples stand in `samples-1.csv`, raw and in SI units, a further file wherever t
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 from jaximp.live.clock import Slots
 from jaximp.live.monitor import Update
 from jaximp.recordings.named_units import SUFFIXES
-from jaximp.recordings.outputs import MARK
+from jaximp.recordings.outputs import MARK, write_whole
 from jaximp.recordings.units import si_unit
 
 EVERY = 1.0
@@ -103,10 +102,7 @@ class Log:
             "torque": torque,
         }
         recording |= {"joint": self._joint} if self._joint != "revolute" else {}
-        text = toml_of({"recording": recording, **self._tables})
-        unfinished = self.folder / f".job.toml.{os.getpid()}.unfinished"
-        unfinished.write_text(text, encoding="utf-8")
-        os.replace(unfinished, self.folder / "job.toml")
+        write_whole(self.folder / "job.toml", toml_of({"recording": recording, **self._tables}).encode())
 
 
 def _append(path: Path, lines: list[str]) -> None:

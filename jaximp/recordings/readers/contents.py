@@ -26,7 +26,10 @@ def columns_in(path: Path) -> Mapping[str, int]:
         raise FileNotFoundError(f"{path}: there is no such file; check the path")
     kind = format_of(path)
     if kind is None or kind.read not in SHAPES:
-        raise RecordingError(f"{path}: cannot look into '{path.suffix}' files; use one of: {', '.join(FORMATS)}")
+        known = [extension for extension, one in FORMATS.items() if one.read in SHAPES]
+        raise RecordingError(
+            f"{path}: cannot look into '{path.suffix}' files, but into {', '.join(known)}: write the job by hand"
+        )
     try:
         refuse_disguise(path)
         found = SHAPES[kind.read](path)
