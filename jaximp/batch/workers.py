@@ -88,7 +88,8 @@ def _on_workers(
     if scheduler is None:
         cluster = LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tcp://",
-            dashboard_address=None, worker_dashboard_address=None, silence_logs=50, env=_environment(),
+            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},  # or it wants port 8787
+            worker_dashboard_address=None, silence_logs=50, env=_environment(),
         )  # fmt: skip
     try:
         with _connected(Client, cluster if cluster is not None else scheduler) as client:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,6 +15,9 @@ import pytest
 
 from factories.studies import content, run
 from jaximp.batch import workers as batch_workers
+
+if TYPE_CHECKING:
+    import psutil
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +57,16 @@ def test_the_devices_of_a_host_share_a_stack(study: Path, tmp_path: Path) -> Non
             np.testing.assert_allclose(found[name], expected[name], 1e-9, err_msg=name)
 
 
+def is_worker(child: psutil.Process) -> bool:
+    """Whether a Dask worker runs in it; of what ended a moment ago the system knows no command."""
+    import psutil
+
+    try:
+        return "spawn_main" in " ".join(child.cmdline())
+    except (psutil.NoSuchProcess, psutil.ZombieProcess):
+        return False
+
+
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_workers_give_the_same_bits_though_one_is_killed(study: Path, alone: Path, tmp_path: Path) -> None:
@@ -64,7 +78,7 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, alone: Pat
     def kill(event: dict[str, object]) -> None:
         """`kill -9` of a worker, when the first batch is done and the others are under way."""
         children = psutil.Process().children(recursive=True)
-        workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+        workers = [child for child in children if is_worker(child)]
         if event["event"] == "batch" and not killed:
             addresses = {connection.laddr.ip for worker in workers for connection in worker.net_connections("inet")}
             assert addresses <= {"127.0.0.1"}
@@ -82,7 +96,7 @@ def test_workers_give_the_same_bits_though_one_is_killed(study: Path, alone: Pat
 def test_somebodys_cluster_gives_the_same(study: Path, alone: Path, tmp_path: Path) -> None:
     """Workers that know nothing of us, but for where we are installed."""
     distributed = pytest.importorskip("distributed")
-    options = {"host": "127.0.0.1", "dashboard_address": None, "worker_dashboard_address": None, "silence_logs": 50}
+    options = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, **options) as cluster:
         assert run(study, tmp_path / "out", scheduler=cluster.scheduler_address).exit_status == 0
     assert content(tmp_path / "out") == content(alone)
