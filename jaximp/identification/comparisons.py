@@ -14,7 +14,7 @@ from jaximp.identification.whitening import White
 from jaximp.least_squares.window import SlidingFit
 from jaximp.models.base import Model
 from jaximp.models.reflex import pathway_of
-from jaximp.trust.changes import Change, common_gain, find_changes, levels
+from jaximp.trust.changes import FEWEST, Change, Course, common_gain, find_changes, levels
 from jaximp.trust.frequencies import ByFrequency, estimate_by_frequency
 from jaximp.trust.score_tests import p_in_words
 from jaximp.types import Numbers
@@ -56,8 +56,8 @@ def by_frequency(pipeline: Pipeline, rows: Rows, several: Sequence[White]) -> tu
 
 def changes(
     pipeline: Pipeline, fit: SlidingFit, which: NDArray[np.int64], start: Numbers, end: Numbers
-) -> dict[str, str]:
-    """Parameters that are not the same in windows that share no rows, and what they are when, in words.
+) -> tuple[dict[str, Course], tuple[str, ...]]:
+    """Parameters that are not the same in windows that share no rows, and those of which no change was found.
 
     **Arguments:** `which` these windows are; `start` and `end` (M,) of all [s].
     """
@@ -65,11 +65,14 @@ def changes(
     value, stderr, dof = (np.asarray(x)[which] for x in (fit.theta, fit.stderr, fit.dof))
     known = np.isfinite(value).all(axis=1) & (stderr > 0).all(axis=1)
     value, stderr, dof, which = value[known], stderr[known], dof[known], which[known]
-    return {
-        model.names[columns[k]]: _when(one, value[:, columns[k]], stderr[:, columns[k]], start[which], end[which])
-        + f" {model.units[columns[k]]}, {p_in_words(one.p)}"
+    found = {
+        model.names[columns[k]]: _course(
+            one, value[:, columns[k]], stderr[:, columns[k]], start[which], end[which], model.units[columns[k]]
+        )
         for k, one in find_changes(value[:, columns], stderr[:, columns], dof).items()
     }
+    asked = [model.names[k] for k in columns] if len(which) >= FEWEST else []
+    return found, tuple(name for name in asked if name not in found)
 
 
 def gain_in_words(model: Model, fit: SlidingFit, apart: int) -> str:
@@ -89,12 +92,10 @@ def gain_in_words(model: Model, fit: SlidingFit, apart: int) -> str:
     )
 
 
-def _when(change: Change, value: Numbers, stderr: Numbers, start: Numbers, end: Numbers) -> str:
-    """`40 until 150 s, then 80`; or between which values it changes."""
-    found = levels(value, stderr)
+def _course(change: Change, value: Numbers, stderr: Numbers, start: Numbers, end: Numbers, unit: str) -> Course:
+    """In levels, where there are any; else between which values it changes."""
+    found, sure = levels(value, stderr), p_in_words(change.p)
     if len(found) < 2:
-        return f"between {change.low:.3g} and {change.high:.3g}"
-    until = [
-        f"{one.value:.3g} until {(end[one.last] + start[after.first]) / 2:.4g} s" for one, after in pairwise(found)
-    ]
-    return ", then ".join([*until, f"{found[-1].value:.3g}"])
+        return Course((change.low, change.high), (), unit, sure)
+    at = (float(end[one.last] + start[after.first]) / 2 for one, after in pairwise(found))
+    return Course(tuple(one.value for one in found), tuple(at), unit, sure)

@@ -21,6 +21,7 @@ from jaximp.models.joint import HumanJoint, parameter_units
 from jaximp.models.tip import TipImpedance
 from jaximp.results import Column, Result
 from jaximp.tracking.results import Track
+from jaximp.trust.changes import Course
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit
@@ -123,8 +124,10 @@ class Estimates(Result):
     """Of each joint the estimates by bands of frequencies, where curves were wanted and there is enough to compare."""
     lacking: Mapping[str, str] = field(default_factory=dict)
     """Parameters that what the model lacks moves beyond error and a share that matters, and why, in words."""
-    changed: Mapping[str, str] = field(default_factory=dict)
-    """Parameters that are not the same in windows that share no rows, and what they are when, in words."""
+    changed: Mapping[str, Course] = field(default_factory=dict)
+    """Parameters that are not the same in windows that share no rows (or surely move along a path), and how."""
+    steady: tuple[str, ...] = ()
+    """Parameters of which no change beyond error and 5 % was found, though it was looked for."""
     reflexes: tuple[Reflex, ...] = ()
     """Of every joint that has one."""
     residuals: Residuals | None = None

@@ -360,6 +360,7 @@ def _side_by_side(model: Joints, parts: list[Estimates]) -> Estimates:
         ),
         lacking={f"joint{j + 1}.{name}": why for j, part in enumerate(parts) for name, why in part.lacking.items()},
         changed={f"joint{j + 1}.{name}": when for j, part in enumerate(parts) for name, when in part.changed.items()},
+        steady=tuple(f"joint{j + 1}.{name}" for j, part in enumerate(parts) for name in part.steady),
         held_out_vaf=np.min([part.held_out_vaf for part in parts], axis=0),
         measured=tuple(windows for part in parts for windows in part.measured),
         threshold=max(thresholds, default=None),

@@ -33,7 +33,7 @@ from jaximp.identification.pipeline import FREELY, Pipeline
 from jaximp.identification.points import (
     SURELY,
     Followed,
-    moves_in_words,
+    courses,
     points_of_path,
     points_of_windows,
     windows_apart,
@@ -52,6 +52,7 @@ from jaximp.models.joint import HumanJoint
 from jaximp.models.reflex import pathway_of
 from jaximp.tracking.results import Track
 from jaximp.trust import plausibility
+from jaximp.trust.changes import Course
 from jaximp.trust.criteria import fake_change_threshold
 from jaximp.trust.limits import TrustLimits
 from jaximp.trust.score_tests import Bands, Misfit, compare_bands, significant
@@ -137,11 +138,11 @@ def judge(
         _drive_note(prepared, misfits, np.asarray(solved.fit.theta)),
     )
     if followed is not None:
-        changed = moves_in_words(points.tracks[0], judge_windows(measured, limits).trusted)
+        changed, steady = courses(points.tracks[0], judge_windows(measured, limits).trusted)
         notes = (*notes, _moving_mass(model, points.tracks[0]))
     else:
         side_by_side = apart * np.flatnonzero(excited_windows(measured, limits)[::apart])
-        changed = changes(pipeline, sure, side_by_side, start, end)
+        changed, steady = changes(pipeline, sure, side_by_side, start, end)
     estimates = Estimates(
         model=model,
         names=model.names,
@@ -164,6 +165,7 @@ def judge(
             *_changes_in_words(pipeline, changed, followed is not None),
         ),
         changed=changed,
+        steady=steady,
         reflexes=reflexes,
         misfits=misfits,
         bands=of_model.bands,
@@ -238,7 +240,7 @@ def _moving_mass(model: Model, track: Track) -> str:
     )
 
 
-def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, str], of_path: bool) -> list[str]:
+def _changes_in_words(pipeline: Pipeline, changed: Mapping[str, Course], of_path: bool) -> list[str]:
     if of_path:
         return [f"{name} moves: {how}" for name, how in changed.items()]
     doubt = "" if pipeline.whitens else "; or its errors are too small, since the noise was taken as white"

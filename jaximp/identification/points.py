@@ -19,6 +19,7 @@ from jaximp.identification.whitening import White
 from jaximp.least_squares.window import SlidingFit
 from jaximp.tracking.paths import track
 from jaximp.tracking.results import Path, Track
+from jaximp.trust.changes import Course
 from jaximp.types import AnyArray, Numbers
 
 STILL = 1e-3
@@ -199,12 +200,12 @@ def points_of_path(
     return Points(fit, around, unseen[around], separate, shown, reconstructed, predicted, (found,))
 
 
-def moves_in_words(track: Track, trusted: NDArray[np.bool_]) -> dict[str, str]:
-    """Parameters that surely move, and how: `60 until 12 s, then 120` for jumps alone, else between which values.
+def courses(track: Track, trusted: NDArray[np.bool_]) -> tuple[dict[str, Course], tuple[str, ...]]:
+    """Parameters that surely move, in levels where they only jump; and those that surely do not.
 
     **Arguments:** which points (M,) are `trusted`.
     """
-    found: dict[str, str] = {}
+    found: dict[str, Course] = {}
     theta, time = np.where(trusted[:, None], track.value, np.nan), np.asarray(track.time)
     for k, name in enumerate(track.names):
         p, jumps, known = track.moves(name), track.jumps(name), np.isfinite(theta[:, k])
@@ -215,14 +216,11 @@ def moves_in_words(track: Track, trusted: NDArray[np.bool_]) -> dict[str, str]:
         ends = [np.quantile(level, [0.05, 0.95]) if len(level) else np.array([0, np.inf]) for level in levels]
         flat = all(np.ptp(end) < FLAT * np.ptp(theta[known, k]) for end in ends)
         if jumps and flat and len(jumps) < MOST_LEVELS:
-            until = [
-                f"{np.median(level):.3g} until {jump.time:.4g} s" for level, jump in zip(levels, jumps, strict=False)
-            ]
-            how = ", then ".join([*until, f"{np.median(levels[-1]):.3g}"])
+            values, at = tuple(float(np.median(level)) for level in levels), tuple(jump.time for jump in jumps)
         else:
-            how = f"between {theta[known, k].min():.3g} and {theta[known, k].max():.3g}"
-        found[name] = f"{how} {track.units[k]}, probability {p:.3g}"
-    return found
+            values, at = (float(theta[known, k].min()), float(theta[known, k].max())), ()
+        found[name] = Course(values, at, track.units[k], f"probability {p:.3g}")
+    return found, tuple(name for name in track.names if track.moves(name) < 1 - SURELY)
 
 
 def _pooled(own: Numbers, stderr: AnyArray, around: NDArray[np.int64], apart: int) -> Callable[[Numbers], Numbers]:

@@ -318,7 +318,7 @@ def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tup
     if not estimates.trusted_in(estimates.names[k]).any():
         return "none trusted" if brief else f"no {estimates.kind} can be trusted", VERMILLION
     if estimates.names[k] in estimates.changed:
-        return estimates.changed[estimates.names[k]].split(f" {estimates.units[k]}")[0], BLUE
+        return estimates.changed[estimates.names[k]].how, BLUE
     return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
 
 

@@ -20,7 +20,9 @@ from jaximp.jobs.job import WindowJob
 from jaximp.least_squares.window import confidence_interval
 from jaximp.models.base import Model
 from jaximp.models.chain import Chain
+from jaximp.reports.headline import headline
 from jaximp.reports.pages import table_of, versions, without_nan
+from jaximp.trust.changes import Course
 from jaximp.types import Recording
 
 if TYPE_CHECKING:
@@ -37,8 +39,10 @@ def summary(
     """
     robot = job.models(recording.joints, recording.sample_rate)[0]
     main = estimates_list[0]
+    found = without_nan(_result(main))
     content = {
-        **_result(main),
+        "headline": headline(found),
+        **found,
         "further_methods": [_result(estimates) for estimates in estimates_list[1:]],
         "window_lengths": [_result(estimates) for estimates in lengths],
         "robot": _robot(main, robot),
@@ -168,12 +172,22 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
             "unit": unit,
             "trusted_share": float(trusted.mean()),
             "determined": name not in loose,
+            "steady": name in estimates.steady,
+            "changed": _course(estimates.changed.get(name), factor[k]),
             "mean": _mean(theta[trusted, k]),
             "sd": _spread(theta[trusted, k]),
+            "from_to_90": _ends(theta[trusted, k]),
             "median_stderr": _median(stderr[trusted, k]),
             "half_width_95": _median((high - low)[trusted, k] / 2),
         } | _of_chain(estimates, k)
     return found
+
+
+def _course(found: Course | None, factor: float) -> dict[str, Any] | None:
+    """How a parameter changes, times a factor."""
+    if found is None:
+        return None
+    return {"values": [factor * value for value in found.values], "at_s": list(found.at), "evidence": found.sure}
 
 
 def _of_chain(estimates: Estimates, k: int) -> dict[str, Any]:
@@ -253,6 +267,11 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 def _median(values: NDArray[np.float64]) -> float:
     return float(np.median(values)) if len(values) else math.nan
+
+
+def _ends(values: NDArray[np.float64]) -> list[float]:
+    """Between which values nine of ten are."""
+    return np.quantile(values, [0.05, 0.95]).tolist() if len(values) else [math.nan, math.nan]
 
 
 def _spread(values: NDArray[np.float64]) -> float:

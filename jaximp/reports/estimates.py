@@ -24,6 +24,7 @@ from jaximp.models.chain import Chain
 from jaximp.models.tip import TipImpedance
 from jaximp.plots.wording import main_parameter, number, percent, pretty_unit, words
 from jaximp.reports.contents import estimates_table, summary
+from jaximp.reports.headline import course_in_words
 from jaximp.reports.pages import (
     Alert,
     Column,
@@ -230,6 +231,7 @@ def page(
         title=recording["name"],
         subtitle=f"{digits(recording['duration_s'])} s at {digits(recording['sample_rate_hz'])} Hz, "
         f"{_estimates_in_words(content)}{method}",
+        headline=content["headline"],
         sections=[
             *load_sections(load),
             Section(heading, [*_warning(estimates_list[0], content), *_answer(content)], void=not _any_answer(content)),
@@ -286,15 +288,35 @@ def _any_answer(content: dict[str, Any]) -> bool:
 def _answer(content: dict[str, Any]) -> list[Part]:
     """The parameters, of a geared joint on both sides of the gear."""
     kind = content["kind"]
-    remark = Prose(
-        f"Where the spread between {kind}s exceeds the interval of one {kind}, the parameter changes over time and its "
-        "mean stands for no single moment: see below how it does.",
-        remark=True,
-    )
+    remark = [
+        Prose(
+            f"A parameter that spreads between {kind}s by more than the interval of one {kind} changes over time: the "
+            "table says between which values nine of ten are, or what it is when.",
+            remark=True,
+        )
+    ]
+    if not any(map(_spreads, content["parameters"].values())):
+        remark = []
     if content["at_joint"] is None:
-        return [_parameter_table(content), remark]
+        return [_parameter_table(content), *remark]
     also = Prose("These are at the joint. The same on the motor's side of the gear, as in the table and the figures:")
-    return [_parameter_table(content["at_joint"]), remark, also, _parameter_table(content)]
+    return [_parameter_table(content["at_joint"]), *remark, also, _parameter_table(content)]
+
+
+def _spreads(value: Mapping[str, Any]) -> bool:
+    """Whether the mean of a parameter stands for no single moment."""
+    sd, half = value["sd"], value["half_width_95"]
+    return value["changed"] is not None or (sd is not None and half is not None and sd > half)
+
+
+def _in_words(value: Mapping[str, Any]) -> str:
+    """The mean of a parameter; what it is when, or between which values, where it changes."""
+    if value["changed"] is not None:
+        return course_in_words(value["changed"])
+    if _spreads(value):
+        low, high = value["from_to_90"]
+        return f"{digits(low, 3)} to {digits(high, 3)}"
+    return digits(value["mean"])
 
 
 def _parameter_table(found: dict[str, Any]) -> Table:
@@ -305,10 +327,10 @@ def _parameter_table(found: dict[str, Any]) -> Table:
         half, mean = value["half_width_95"], value["mean"]
         interval = "–"
         if half is not None:
-            zero = mean is not None and abs(mean) < half
+            zero = mean is not None and abs(mean) < half and not _spreads(value)
             loose = "" if value["determined"] else ", not determined"
             interval = f"± {number(half, 2)}" + (", holds zero" if zero else loose)
-        rows.append([words(name), digits(mean), interval, digits(value["sd"], 2), pretty_unit(value["unit"])])
+        rows.append([words(name), _in_words(value), interval, digits(value["sd"], 2), pretty_unit(value["unit"])])
     medians = {f"{words(name)} (median)": value for name, value in found["equilibrium"].items()}
     medians |= {f"{words(name)} mean delay (median)": value["delay"] for name, value in found["reflex"].items()}
     for name, value in medians.items():

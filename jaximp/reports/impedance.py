@@ -21,6 +21,7 @@ from jaximp.perturbation.isolation.output_error import MISFIT
 from jaximp.perturbation.stiffness import MATRICES, MATRIX_OF
 from jaximp.perturbation.trials_result import TrialsResult
 from jaximp.plots.wording import number, percent, pretty_unit
+from jaximp.reports.headline import headline_of_arm
 from jaximp.reports.pages import (
     Alert,
     Column,
@@ -123,6 +124,7 @@ def page(result: TrialsResult, content: dict[str, Any]) -> Page:
         title=content["recording"]["name"],
         subtitle=f"Damping and stiffness of an arm's joints from {content['trials']} perturbed movements, "
         f"{number(1000 * content['window_s'])} ms after the onset, by {content['method_description']}",
+        headline=content["headline"],
         sections=[
             Section("", alerts),
             Section("", [_answer(content), *_explained(content)], void=not trusted),
@@ -215,7 +217,8 @@ def summary(result: TrialsResult, job: TrialsJob) -> dict[str, Any]:
         "versions": versions(),
         "job": job.text,
     }
-    return without_nan(content)
+    content = without_nan(content)
+    return {"headline": headline_of_arm(content), **content}
 
 
 def endpoint(found: ArmImpedance) -> dict[str, Any]:

@@ -118,6 +118,8 @@ class Page:
     """PNG files by the figures' names."""
     live: Mapping[str, Live] = field(default_factory=dict)
     """Figures for the screen by the same names; a figure may have none."""
+    headline: str = ""
+    """The result in words."""
 
 
 def figure_sections(

@@ -17,6 +17,7 @@ from jaximp.posterior.densities import stiffness_matrices
 from jaximp.posterior.draws import Posterior, summarise
 from jaximp.posterior.files import save_posterior
 from jaximp.posterior.inference import LEVELS, Inference, sentences
+from jaximp.reports.headline import headline_of_posterior
 from jaximp.reports.pages import (
     Alert,
     Column,
@@ -229,6 +230,7 @@ def _torque(found: Inference, length: float) -> Any:
 
 def _write(folder: Path, content: dict[str, Any], figures: dict[str, Any], live: Mapping[str, Live]) -> dict[str, Any]:
     content = without_nan(content)
+    content = {"headline": headline_of_posterior(content), **content}
     images = {name: plots.png(figure) for name, figure in figures.items()}
     write_page(folder, _page(content, images, {name: one for name, one in live.items() if name in images}), content)
     return content
@@ -243,6 +245,7 @@ def _page(content: dict[str, Any], images: dict[str, bytes], live: Mapping[str, 
     return Page(
         title=content["name"],
         subtitle=f"Posterior of {content['of']}: {content['sampler']}",
+        headline=content["headline"],
         sections=[
             Section("", alerts),
             Section("", [_parameter_table(content["parameters"]), *paper], void=bool(why)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,6 +18,31 @@ FEWEST = 3
 BLOCKS, SELDOM, AGREE = 6, 0.003, 3.0
 """Stretches of a record between which a gain is compared, with what probability a constant mass seems to change, and
 how well all parameters must agree on a common factor, by chi-squared per degree of freedom."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a parameter changes over a record, as people tell it."""
+
+    values: tuple[float, ...]
+    """Levels, one after another; or the two ends between which it moves."""
+    at: tuple[float, ...]
+    """When one level ends and the next begins [s]; empty where it moves otherwise."""
+    unit: str
+    sure: str
+    """How sure it is that it changes, in words."""
+
+    @property
+    def how(self) -> str:
+        """`40 until 150 s, then 80`, or `between 40 and 80`."""
+        told = [f"{value:.3g}" for value in self.values]
+        if not self.at:
+            return f"between {told[0]} and {told[1]}"
+        until = [f"{value} until {time:.4g} s" for value, time in zip(told, self.at, strict=False)]
+        return ", then ".join([*until, told[-1]])
+
+    def __str__(self) -> str:
+        return f"{self.how} {self.unit}, {self.sure}"
 
 
 class Change(NamedTuple):

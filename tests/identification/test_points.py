@@ -81,7 +81,11 @@ def test_a_path_follows_a_step_that_windows_blur() -> None:
 
 def test_what_moves_is_told_and_when_it_jumps() -> None:
     assert set(followed().changed) == {"stiffness"}
-    assert followed().changed["stiffness"].startswith(("60", "59"))
+    course = followed().changed["stiffness"]
+    assert course.values == pytest.approx((BEFORE, AFTER), rel=0.02)
+    assert course.at == pytest.approx((CHANGE,), abs=0.15)
+    assert followed().steady[0] == "inertia"
+    assert "stiffness" not in followed().steady
     (track,) = followed().tracks
     (jump,) = track.jumps("stiffness")
     assert abs(jump.time - CHANGE) < 0.15
