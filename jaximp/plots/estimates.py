@@ -71,8 +71,23 @@ def parameters_over_time(estimates: Estimates, level: float = 0.95) -> Figure:
         panel.set_visible(False)
     for panel in panels[-1]:
         panel.set_xlabel(_time_label(estimates))
+    _span_of_a_window(panels[-1, 0], estimates)
     _legend(figure, panels.flat[0], [estimates])
     return figure
+
+
+def _span_of_a_window(panel: Axes, estimates: Estimates) -> None:
+    """A bar as long as the windows, over which each estimate is an average; a path has none."""
+    first, last = panel.get_xlim()
+    if estimates.tracks or estimates.window > (last - first) / 2:
+        return
+    end = first + 0.02 * (last - first) + estimates.window
+    over_axes = panel.get_xaxis_transform()
+    panel.plot([end - estimates.window, end], [0.12, 0.12], "|-", color="black", transform=over_axes, linewidth=1)
+    panel.annotate(
+        f"a window, {estimates.window:g} s", (end, 0.12), (5, 0), xycoords=over_axes, textcoords="offset points",
+        verticalalignment="center", fontsize="small",
+    )  # fmt: skip
 
 
 def _time_label(estimates: Estimates) -> str:

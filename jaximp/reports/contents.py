@@ -28,6 +28,10 @@ from jaximp.types import Recording
 if TYPE_CHECKING:
     import pyarrow as pa
 
+SCATTERED = 0.25
+"""Share of intervals of 95 % beside a value from which on it does not stand for all of them: windows overlap, and where
+one interval misses the truth by chance its neighbours do."""
+
 
 def summary(
     estimates_list: Sequence[Estimates], job: WindowJob, recording: Recording, lengths: Sequence[Estimates] = ()
@@ -177,6 +181,7 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
             "mean": _mean(theta[trusted, k]),
             "sd": _spread(theta[trusted, k]),
             "from_to_90": _ends(theta[trusted, k]),
+            "one_value": _one_value(theta[trusted, k], low[trusted, k], high[trusted, k]),
             "median_stderr": _median(stderr[trusted, k]),
             "half_width_95": _median((high - low)[trusted, k] / 2),
         } | _of_chain(estimates, k)
@@ -267,6 +272,15 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 def _median(values: NDArray[np.float64]) -> float:
     return float(np.median(values)) if len(values) else math.nan
+
+
+def _one_value(value: NDArray[np.float64], low: Any, high: Any) -> bool:
+    """Whether one value lies within nearly all of the intervals; each counts by how narrow it is."""
+    half = np.maximum((np.asarray(high) - np.asarray(low)) / 2, np.finfo(float).tiny)
+    if len(value) < 2 or not np.isfinite(half).all():
+        return True
+    mean = (value / half**2).sum() / (1 / half**2).sum()
+    return float(np.mean(np.abs(value - mean) > half)) < SCATTERED
 
 
 def _ends(values: NDArray[np.float64]) -> list[float]:

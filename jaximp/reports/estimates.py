@@ -290,8 +290,8 @@ def _answer(content: dict[str, Any]) -> list[Part]:
     kind = content["kind"]
     remark = [
         Prose(
-            f"A parameter that spreads between {kind}s by more than the interval of one {kind} changes over time: the "
-            "table says between which values nine of ten are, or what it is when.",
+            f"Where intervals of {kind}s exclude each other no mean stands for all of them: the table says between "
+            "which values nine of ten are, or what the parameter is when.",
             remark=True,
         )
     ]
@@ -305,8 +305,7 @@ def _answer(content: dict[str, Any]) -> list[Part]:
 
 def _spreads(value: Mapping[str, Any]) -> bool:
     """Whether the mean of a parameter stands for no single moment."""
-    sd, half = value["sd"], value["half_width_95"]
-    return value["changed"] is not None or (sd is not None and half is not None and sd > half)
+    return value["changed"] is not None or not value["one_value"]
 
 
 def _in_words(value: Mapping[str, Any]) -> str:

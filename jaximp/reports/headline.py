@@ -29,6 +29,7 @@ def headline(result: Mapping[str, Any]) -> str:
         told.append(f"{len(known)} of {len(parameters)} parameters are determined.")
     elif not told:
         told.append(_one_value(result, known))
+    told += [_range(name, one, result["kind"]) for name, one in known.items() if _is_open(one)]
     unsure = [name for name, one in known.items() if not one["steady"] and one["changed"] is None]
     if result["kind"] == "point":
         told += [f"No change was found of {_named(steady)}."] if steady else []
@@ -100,8 +101,18 @@ def _changes(name: str, one: Mapping[str, Any]) -> str:
     return f"{_capital(words(name))} {how} ({found['evidence']})."
 
 
+def _is_open(one: Mapping[str, Any]) -> bool:
+    """Whether no value stands for a parameter that was not asked for changes, such as a constant torque."""
+    return one["changed"] is None and not one["steady"] and not one["one_value"]
+
+
+def _range(name: str, one: Mapping[str, Any], kind: str) -> str:
+    low, high = (number(value, 3) for value in one["from_to_90"])
+    return f"{_capital(words(name))} is between {low} and {high} {pretty_unit(one['unit'])} in nine of ten {kind}s."
+
+
 def _one_value(result: Mapping[str, Any], known: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of the parameter that stands for all, where none changes."""
+    """Of the parameter that a person looks for, where none changes."""
     name = main_parameter(list(known))
     one, kind = known[name], result["kind"]
     where = "" if result["windows"]["count"] == 1 else f" at one {kind}" if kind == "point" else " in one window"

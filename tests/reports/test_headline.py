@@ -12,6 +12,7 @@ from jaximp.trust.verdicts import TRUSTED, WEAK
 
 def parameter(mean: float | None, **more: Any) -> dict[str, Any]:
     plain = {"unit": "N m/rad", "half_width_95": 0.5, "determined": True, "steady": False, "changed": None}
+    plain |= {"one_value": True, "from_to_90": [-6.0, -3.0]}
     return plain | {"mean": mean} | more
 
 
@@ -43,6 +44,12 @@ def test_where_nothing_changes_one_value_stands_for_all() -> None:
     said = "No change beyond error and 5 % was found of inertia and stiffness."
     one = "Stiffness is 60 N m/rad (± 0.5"
     assert headline(result(**steady)) == f"{one} in one window, 95 %). {said}"
+
+
+def test_what_was_not_compared_and_is_no_one_value_is_told_as_a_range() -> None:
+    found = {"stiffness": parameter(60.0, steady=True), "offset_torque": parameter(-4.5, one_value=False)}
+    said = headline(result(**found))
+    assert "Offset torque is between −6 and −3 N m/rad in nine of ten windows." in said
 
 
 def test_of_a_path_it_is_said_what_is_open() -> None:

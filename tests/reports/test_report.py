@@ -18,6 +18,7 @@ import pytest
 from factories.estimates import JOB, identified, recording, without_trust
 from jaximp.identification.estimates import Estimates
 from jaximp.jobs.job import Job, parse_job
+from jaximp.reports import contents
 from jaximp.reports import estimates as report
 from jaximp.trust.frequencies import ByFrequency
 from jaximp.types import Recording
@@ -248,3 +249,17 @@ def test_the_tests_of_a_robot_name_what_would_move_most() -> None:
     assert row[2] == "12"
     assert [part.split(" by ")[0] for part in row[3].split(", ")] == ["link4.mass", "link8.mass", "link7.mass"]
     assert said.text.endswith("link4.mass is off; and 4 more parameters")
+
+
+def test_no_mean_stands_for_windows_that_exclude_each_other(case: tuple[Job, Recording, Estimates]) -> None:
+    """A constant torque that is another one in the second half; wide intervals beside it say nothing."""
+    job, source, estimates = case
+    value = np.array(estimates.fit.theta)
+    value[len(value) // 2 :, -1] -= 3.0
+    moved = replace(estimates, fit=eqx.tree_at(lambda fit: fit.theta, estimates.fit, value))
+    content = contents.summary([moved], job, source)
+    one_value = {name: found["one_value"] for name, found in content["parameters"].items()}
+    assert one_value == {"inertia": True, "damping": True, "stiffness": True, "offset_torque": False}
+    assert "Offset torque is between −3.6 and −0.6 N m in nine of ten windows." in content["headline"]
+    (answer, *_) = report.page([moved], [], content).sections[0].parts
+    assert answer.rows[-2][:2] == ["offset torque", "−3.6 to −0.6"]
