@@ -26,6 +26,7 @@ from jaximp.least_squares.chunks import (
     solve_pieces,
     solve_traced,
 )
+from jaximp.least_squares.wide import pays, solve_wide
 from jaximp.least_squares.window import (
     Fit,
     SlidingFit,
@@ -46,6 +47,10 @@ BATCH_NUMBERS = 4_000_000
 
 FROM_CHUNKS = 200_000_000
 """So many numbers in all windows together, and sums that windows share are worth the time they take to compile."""
+
+
+ALIKE = 64
+"""Windows that are decomposed one by one are filled up to multiples of this many."""
 
 
 FEWEST_ROWS = 4
@@ -102,7 +107,7 @@ def sliding_least_squares(
     """
     given = _given(W, y, window, step, sample_rate, valid, weights)
     known: Any = noise if noise is None or is_traced(noise) else np.asarray(noise, given.W.dtype)
-    found = _in_chunks(given, known)
+    found = _many_columns(given, known, room) or _in_chunks(given, known)
     if found is not None:
         return found
     starts, n_windows = given.starts, len(given.starts)
@@ -311,6 +316,27 @@ def _in_chunks(given: _Given, noise: AnyArray | None = None, statistics: bool = 
     weighted = scale.dtype != bool
     task = make_task(window * n, step * n, n, noise, statistics, weighted, n_windows)
     return _from_shared_sums(W, y, scale, task)
+
+
+def _many_columns(given: _Given, noise: AnyArray | None, room: int | None) -> SlidingFit | None:
+    """Windows of many columns, without anything that takes long to compile; None where that is not how to solve them.
+
+    Windows that the sums do not suit are decomposed one by one.
+    """
+    W, y, scale, window, _, starts = given
+    p, n = W.shape[-1], math.prod(y.shape[1:])
+    known = not is_traced(W, y, scale, noise) and noise is None and jax.default_backend() == "cpu"
+    if not known or W.dtype != np.float64 or not pays(len(starts), p, n):
+        return None
+    arrays = np.asarray(W).reshape(-1, n, p), np.asarray(y).reshape(-1, n), np.asarray(scale).reshape(-1, n)
+    fit, doubtful = solve_wide(*arrays, window, starts)
+    which = np.flatnonzero(doubtful)
+    if len(which):
+        some = np.pad(starts[which], (0, -len(which) % ALIKE), mode="edge")  # few sizes share compiled code
+        exact = _solve_all(W, y, scale, None, jnp.asarray(some), window, room or window)
+        for whole, part in zip(jax.tree.leaves(fit), jax.tree.leaves(exact), strict=True):
+            whole[which] = np.asarray(part)[: len(which)]
+    return fit
 
 
 def _from_shared_sums(W: Array, y: Array, scale: Array, task: Task) -> Any:
