@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test test-all lint studies notebooks job-keys lock clean
+.PHONY: setup demo test test-all lint studies notebooks job-keys docs lock clean
 
 setup: .venv/ready
 
@@ -42,6 +42,10 @@ notebooks: setup
 # The reference of all keys of a job file, from the code.
 job-keys: setup
 	$(BIN)/python docs/make_job_keys.py
+
+# The documentation as a site in out/site, which needs no network. A warning is an error.
+docs: setup
+	$(BIN)/python docs/site/build.py out/site
 
 # Pinned versions for every supported Python, without any download address.
 lock: setup

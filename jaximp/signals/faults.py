@@ -18,8 +18,10 @@ LONGEST_GLITCH, SIDE = 6, 3
 the signal must be smooth."""
 AROUND = 25
 """Samples on either side by whose roughness a glitch is judged."""
-STANDS_OUT, SMOOTH = 20.0, 6.0
-"""A glitch is so many times the noise from its neighbours, and so many times as far as these are from each other."""
+STANDS_OUT = 20.0
+"""A glitch is so many times the noise from its neighbours."""
+SMOOTH = 6.0
+"""A glitch is so many times as far from its neighbours as these are from each other."""
 CROWDED, FEWEST_CROWDED = 2.0, 10
 """So many times the samples of the band below may crowd at a limit. (At a turning point it is up to 2.4 times.)"""
 BEYOND = 0.5
