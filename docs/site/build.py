@@ -22,6 +22,7 @@ RESULTS = ROOT / "experiments" / "results"
 
 NAVIGATION = {
     "Tutorials": (
+        "notebooks/00_my_first_recording",
         "robot-and-human",
         "arm-trials",
         "robots",
@@ -76,7 +77,7 @@ def command_line() -> str:
 def tables() -> Iterator[str]:
     """The tables that the studies wrote."""
     yield "# Tables of the studies\n"
-    yield "As the scripts in `experiments/` and `jaximp reproduce` wrote them; [results](results.md) says what they mean."
+    yield "As the studies and `jaximp reproduce` wrote them; [results](results.md) says what they mean."
     for path in sorted(RESULTS.rglob("*.md")):
         name = path.stem if path.parent == RESULTS else path.parent.name
         yield f"\n## {name}\n\n{path.read_text(encoding='utf-8').strip()}\n"

@@ -24,6 +24,13 @@ from .robots import load_by_method as load_by_method
 from .robots import parameters_against_urdf as parameters_against_urdf
 from .robots import parameters_by_method as parameters_by_method
 from .robots import robot as robot
+from .style import BLACK as BLACK
+from .style import BLUE as BLUE
+from .style import GREEN as GREEN
+from .style import ORANGE as ORANGE
+from .style import STYLE as STYLE
+from .style import VERMILLION as VERMILLION
+from .style import WIDTH as WIDTH
 from .style import Panel as Panel
 from .style import curves as curves
 from .style import png as png

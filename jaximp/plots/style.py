@@ -26,7 +26,11 @@ WIDTH = 17 / 2.54
 POINTS = 4000
 """A line of more points than this is drawn as its envelope."""
 # Okabe and Ito: told apart by every kind of colour vision, and by lightness in print.
-BLACK, BLUE, VERMILLION, GREEN, ORANGE = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00"
+BLACK = "#000000"
+BLUE = "#0072B2"
+VERMILLION = "#D55E00"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
 PALE, HATCH = "0.55", "0.75"
 MEASURED = "0.68"
 """A wide line under that of a model."""
@@ -52,6 +56,7 @@ STYLE: Any = {
     "grid.linewidth": 0.5,
     "hatch.linewidth": 0.4,
 }
+"""Settings of matplotlib (`rcParams`) that all figures share."""
 
 
 def styled(function: Callable[P, R]) -> Callable[P, R]:

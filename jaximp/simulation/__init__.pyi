@@ -1,3 +1,5 @@
+from .ankle import ankle_recording as ankle_recording
+from .ankle import write_ankle_recording as write_ankle_recording
 from .arm_recordings import Sensors as Sensors
 from .arm_recordings import arm_movements as arm_movements
 from .arm_recordings import arm_postures as arm_postures

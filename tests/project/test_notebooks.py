@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -79,3 +82,24 @@ def test_it_is_kept_with_its_results(path: Path) -> None:
     assert path.stat().st_size < LARGEST
     text = path.read_text(encoding="utf-8")
     assert not [word for word in ("/home/", "/tmp/", "/Users/", "site-packages") if word in text]
+
+
+def private(notebook: Any) -> Iterator[str]:
+    """What a notebook takes from jaximp that is no public name."""
+    source = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jaximp":
+            public = getattr(import_module(str(node.module)), "__all__", ())
+            yield from (f"{node.module}.{name.name}" for name in node.names if name.name not in public)
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names if name.name.startswith("jaximp."))
+        elif isinstance(node, ast.Attribute) and (found := re.match(r"jaximp\.(\w+)\.(\w+)$", ast.unparse(node))):
+            public = getattr(import_module("jaximp"), found[1])
+            yield from [found[0]] * (found[2] not in getattr(public, "__all__", dir(public)))
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "jaximp":
+            yield from [ast.unparse(node)] * (node.attr not in import_module("jaximp").__all__)
+
+
+@every_notebook
+def test_it_uses_public_names_alone(path: Path) -> None:
+    assert not list(private(nbformat.read(path, as_version=4)))
