@@ -44,6 +44,16 @@ class Recording:
 
     Angles [rad] and torques [N m] for revolute joints, positions [m] and forces [N] for prismatic ones. A sample
     that was not measured (a gap, NaN) is False in `valid` and NaN in the arrays.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.005)
+    >>> recording = jaximp.recording_from_arrays(t, np.sin(t), np.cos(t), name="knee")
+    >>> print(recording.name, recording.joints, len(recording.time), recording.valid.all())
+    knee ('revolute',) 800 True
+
+    ```
     """
 
     time: NDArray[np.float64]

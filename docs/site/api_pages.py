@@ -74,6 +74,10 @@ def _page(root: Path, package: str, names: list[str]) -> Iterator[str]:
     yield f"# {package}\n"
     yield f"{_text(module)}\n"
     if package == "jaximp":
+        yield (
+            "Examples take for granted that `jaximp` and numpy (as `np`) are imported, that float64 is on "
+            '(`jax.config.update("jax_enable_x64", True)`), and that they run beside the folder `examples`.\n'
+        )
         yield "The names of all packages, which stand on pages of their own:\n"
         yield from ["```{toctree}", ":maxdepth: 1\n", *(each for each in faces(root) if each != package), "```\n"]
     yield from [f"{FENCE[:3]}{{py:module}} {package}", FENCE[:3] + "\n"]

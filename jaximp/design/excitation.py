@@ -55,7 +55,19 @@ COLLINEAR = 1e6
 
 @dataclass(frozen=True)
 class Design:
-    """A motion that excites a model, and how good it is."""
+    """A motion that excites a model, and how good it is.
+
+    **Example:**
+
+    ```pycon
+    >>> model = jaximp.models.HumanJoint(offset=False)  # doctest: +SKIP
+    >>> limits = jaximp.Limits(position=(-0.3, 0.3), velocity=2)  # doctest: +SKIP
+    >>> design = jaximp.design_excitation(model, limits=limits, harmonics=3, starts=2)  # doctest: +SKIP
+    >>> motion = design.sampled(100)  # doctest: +SKIP
+    >>> print(sorted(motion), motion["position"].shape)  # doctest: +SKIP
+
+    ```
+    """
 
     trajectory: FourierSeries
     model: Model
@@ -224,6 +236,16 @@ def design_excitation(
     **Raises:** `ValueError` for limits that no motion can keep (it names them), and for settings that make no sense.
 
     **Source:** Tout et al. 2023, III-A; the series of Swevers et al. 1997.
+
+    **Example:**
+
+    ```pycon
+    >>> model = jaximp.models.HumanJoint(offset=False)  # doctest: +SKIP
+    >>> limits = jaximp.Limits(position=(-0.3, 0.3), velocity=2)  # doctest: +SKIP
+    >>> design = jaximp.design_excitation(model, limits=limits, harmonics=3, starts=2)  # doctest: +SKIP
+    >>> print(round(design.condition, 1), round(design.lower_bound, 1))  # doctest: +SKIP
+
+    ```
     """
     require_float64()
     if moved is None:

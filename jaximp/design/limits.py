@@ -18,7 +18,17 @@ SYMMETRIC = ("velocity", "acceleration", "jerk", "torque")
 
 @dataclass(frozen=True)
 class Limits:
-    """What the motion must keep at every instant: one number for all joints, or one for each."""
+    """What the motion must keep at every instant: one number for all joints, or one for each.
+
+    **Example:**
+
+    ```pycon
+    >>> limits = jaximp.Limits(position=(-0.3, 0.3), velocity=2)
+    >>> print(limits.velocity, limits.torque)
+    2 inf
+
+    ```
+    """
 
     position: tuple[Any, Any] = (-math.inf, math.inf)
     """Lowest and highest position [rad or m]; both finite, or neither."""

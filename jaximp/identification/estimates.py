@@ -74,7 +74,20 @@ class HumanPart:
 
 @dataclass(frozen=True)
 class Estimates(Result):
-    """One model in all windows of one recording: M estimates of p parameters."""
+    """One model in all windows of one recording: M estimates of p parameters.
+
+    **Example:**
+
+    ```pycon
+    >>> recording = jaximp.read_job("examples/ankle.toml").load()
+    >>> model, filters = jaximp.models.HumanJoint(), {"position_cutoff": 90, "decimation_cutoff": 45}
+    >>> (found,) = jaximp.identify(recording, model=model, window_s=2, **filters)
+    >>> low, high = found["stiffness"].interval()
+    >>> print(found.names[2], found.units[2], low[0] < 60 < high[0], found.trusted[0])
+    stiffness N m/rad True True
+
+    ```
+    """
 
     model: Model
     """What was identified."""

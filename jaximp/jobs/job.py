@@ -309,7 +309,17 @@ class TrialsJob:
 
 
 Job = WindowJob | TrialsJob
-"""What a job file with measurements says; that of a design is a `DesignJob`."""
+"""What a job file with measurements says; that of a design is a `DesignJob`.
+
+**Example:**
+
+```pycon
+>>> job = jaximp.read_job("examples/ankle.toml")
+>>> isinstance(job, jaximp.Job)
+True
+
+```
+"""
 
 
 @lru_cache(maxsize=64)
@@ -327,12 +337,41 @@ def read_job(path: str | Path) -> Job:
     """Read and check a job file.
 
     **Raises:** `ValueError` with one line that names the key and the remedy.
+
+    **Example:**
+
+    ```pycon
+    >>> job = jaximp.read_job("examples/ankle.toml")
+    >>> print(job.window.length, job.filter.position_cutoff)
+    2.0 90.0
+
+    ```
     """
     return read(path, parse_job)
 
 
 def parse_job(text: str, folder: Path = Path()) -> Job:
-    """A job from TOML text; relative file names start at `folder`."""
+    """A job from TOML text; relative file names start at `folder`.
+
+    **Example:**
+
+    ```pycon
+    >>> job = jaximp.parse_job('''
+    ... [recording]
+    ... file = "knee.csv"
+    ... time = { column = "t", unit = "s" }
+    ... position = { column = "q", unit = "deg" }
+    ... torque = { column = "tau", unit = "N m" }
+    ... [model]
+    ... human = true
+    ... [window]
+    ... length = 1.5
+    ... ''')
+    >>> job.window.length
+    1.5
+
+    ```
+    """
     tables = tomllib.loads(text)
     recordings = ["recording", "robot_recording", "robot_recording_after"]
     known = [*recordings, "held_out", "model", "window", "track", "filter", "trust", "reference_period", "design"]

@@ -47,6 +47,17 @@ def identify(
     **Returns:** `Estimates` of a recording's windows, or, of a job with `[trials]`, what `identify_trials` does.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
+
+    **Example:**
+
+    ```pycon
+    >>> recording = jaximp.read_job("examples/ankle.toml").load()
+    >>> model, filters = jaximp.models.HumanJoint(), {"position_cutoff": 90, "decimation_cutoff": 45}
+    >>> (found,) = jaximp.identify(recording, model=model, window_s=2, **filters)
+    >>> print(found.changed["stiffness"].partition(", p")[0])
+    60 until 12 s, then 120 N m/rad
+
+    ```
     """
     if isinstance(job, Recording):
         given = FilterSettings(position_cutoff=position_cutoff, decimation_cutoff=decimation_cutoff)
@@ -130,7 +141,18 @@ def identify_recording(
     progress: Progress = lambda share: None,
     held_out: Recording | None = None,
 ) -> list[Estimates]:
-    """As `identify`, for recordings that are in memory; `alone` may be two, before and after the human's."""
+    """As `identify`, for recordings that are in memory; `alone` may be two, before and after the human's.
+
+    **Example:**
+
+    ```pycon
+    >>> job = jaximp.read_job("examples/ankle.toml")
+    >>> (found,) = jaximp.identify_recording(job, job.load())
+    >>> print(found.names, found.trusted.mean().round(1))
+    ('inertia', 'damping', 'stiffness', 'offset_torque') 0.9
+
+    ```
+    """
     job, recording = complete(job, recording, alone, progress)
     return estimate(job.pipeline_for(recording), recording, alone, progress, held_out)
 
@@ -187,6 +209,14 @@ def infer(job: Job, progress: Progress = lambda share: None) -> Inference | ArmI
 
     **Raises:** `ValueError` with one line that names the cause and the remedy: filters inside every window, parameters
     that the data leave undetermined, an impossible prior, an impedance without standard errors, and as `identify`.
+
+    **Example:**
+
+    ```pycon
+    >>> found = jaximp.infer(jaximp.read_job("examples/ankle.toml"))  # doctest: +SKIP
+    >>> print(found.whole["stiffness"].mean().round(-1), "not one value" if found.why else "")  # doctest: +SKIP
+
+    ```
     """
     if isinstance(job, TrialsJob):
         return infer_trials(job, progress)

@@ -28,6 +28,15 @@ def identify_trials(job: Job, progress: Progress = lambda share: None) -> Trials
     """Run a job with `[trials]`. It writes no files.
 
     **Raises:** `ValueError` with one line that names the cause and the remedy.
+
+    **Example:**
+
+    ```pycon
+    >>> job = jaximp.read_job("arm/job.toml")  # by `jaximp simulate arm --out arm`  # doctest: +SKIP
+    >>> found = jaximp.identify_trials(job).main  # doctest: +SKIP
+    >>> print(found.K, found.verdict, found.reason)  # doctest: +SKIP
+
+    ```
     """
     require_float64()
     if not isinstance(job, TrialsJob):

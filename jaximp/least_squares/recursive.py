@@ -147,6 +147,18 @@ def recursive_least_squares(
     **Source:** Tout et al. 2023, section IV-B. What becomes of the covariance without excitation, and what else there
     is against it: Lai and Bernstein 2024 (arXiv 2404.10844). Holding the estimate is the conditional updating of Åström
     and Wittenmark 1995. It leaves all other estimates those of exponential forgetting; directional forgetting does not.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.01)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> noise = 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> fit = jaximp.recursive_least_squares(W, W @ [1, 20] + noise, forgetting=0.99)
+    >>> print(fit.theta.shape, fit.theta[-1].round(0))
+    (400, 2) [ 1. 20.]
+
+    ```
     """
     require_float64(W, y)
     W, y = jnp.asarray(W, float), jnp.asarray(y, float)

@@ -104,6 +104,19 @@ def sliding_least_squares(
     than parameters, and numbers that are not finite where `valid` does not exclude them.
 
     **Source:** Tout et al. 2023, III-B.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.01)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> noise = 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> y = W[:, 0] + np.where(t < 2, 20, 30) * W[:, 1] + noise
+    >>> fit = jaximp.sliding_least_squares(W, y, window=1.0, step=1.0, sample_rate=100)
+    >>> print(fit.theta.shape, fit.last, fit.theta[:, 1].round(0))
+    (4, 2) [ 99 199 299 399] [20. 20. 30. 30.]
+
+    ```
     """
     given = _given(W, y, window, step, sample_rate, valid, weights)
     known: Any = noise if noise is None or is_traced(noise) else np.asarray(noise, given.W.dtype)
@@ -152,6 +165,20 @@ def sliding_pieces(
     where that has some ten thousand windows. `first` and `last` count from the recording's beginning.
 
     **Raises:** `ValueError` as `sliding_least_squares`, when it comes to the piece in question.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.01)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> noise = 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> pieces = zip(np.split(W, 4), np.split(W @ [1, 20] + noise, 4))
+    >>> for part in jaximp.sliding_pieces(pieces, window=1.0, step=1.0, sample_rate=100):
+    ...     print(part.theta[:, 1].round(0))
+    ...
+    [20. 20. 20. 20.]
+
+    ```
     """
     window, step = in_samples("window", window, sample_rate), in_samples("step", step, sample_rate)
     window_starts(window, window, step)
@@ -200,6 +227,19 @@ def adaptive_least_squares(
     **Raises:** `ValueError` as `sliding_least_squares`, and for noise that is correlated over too many samples.
 
     **Source:** named as future work by Tout et al. 2023, VI.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.01)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> noise = 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> y, stderr = W @ [1, 20] + noise, np.array([0.05, 0.05])
+    >>> fit = jaximp.adaptive_least_squares(W, y, stderr, shortest=0.2, longest=2.0, sample_rate=100)
+    >>> print(fit.theta[-1].round(0))
+    [ 1. 20.]
+
+    ```
     """
     require_float64(W, y)
     shortest, longest = (in_samples(*x, sample_rate) for x in (("shortest", shortest), ("longest", longest)))

@@ -199,6 +199,19 @@ def confidence_interval(
 
     **Raises:** `ValueError` for a level that is no probability, and inside `jit`, `vmap` and `grad`: Student's quantile
     is scipy's.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.01)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> noise = 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> fit = jaximp.sliding_least_squares(W, W @ [1, 20] + noise, window=400)
+    >>> low, high = jaximp.confidence_interval(fit)
+    >>> print(low[0, 1] < 20 < high[0, 1])
+    True
+
+    ```
     """
     if hasattr(theta, "stderr"):
         level = level if stderr is None else stderr

@@ -30,6 +30,14 @@ class ArmImpedance(ArmEstimate):
     """Damping and stiffness of an arm's joints by one method, and whether to believe them.
 
     The verdict is no field: the rules make it of the numbers that stand beside it, whoever puts them there.
+
+    **Example:**
+
+    ```pycon
+    >>> found = jaximp.identify_trials(jaximp.read_job("arm/job.toml")).main  # doctest: +SKIP
+    >>> print(found.D, found.K, found.trusted, found.reason)  # doctest: +SKIP
+
+    ```
     """
 
     limits: TrustLimits
@@ -106,6 +114,16 @@ def identify_impedance(
     onset; `cutoff` (2,) [Hz] for methods that have a high-pass; `limits` of what is trusted.
 
     **Raises:** `ValueError` for a method that does not exist, and what the method raises.
+
+    **Example:**
+
+    ```pycon
+    >>> perturbed, unperturbed, notes = jaximp.read_job("arm/job.toml").trials.load()  # doctest: +SKIP
+    >>> geometry = jaximp.models.ArmGeometry(lengths=(0.29, 0.34))  # doctest: +SKIP
+    >>> arm = jaximp.perturbation.KnownArm(geometry, (0.35, 0.08, 0.07))  # doctest: +SKIP
+    >>> found = jaximp.identify_impedance(perturbed, unperturbed, arm, "gomi_kawato")  # doctest: +SKIP
+
+    ```
     """
     found = isolate(perturbed, unperturbed, arm, method, window, cutoff)
     own, linearised = found.impedance, METHODS[method].linearised

@@ -156,6 +156,18 @@ def fit_stiffness(
     is off. Data that leave parameters undetermined, or are not finite, give a fit that is not `ok`.
 
     **Source:** Börner et al. 2020, eqs. (36) to (38).
+
+    **Example:**
+
+    ```pycon
+    >>> x, v = np.random.default_rng(0).normal(size=(2, 500, 2))
+    >>> torque = v @ [[2, 0.5], [0.5, 1]] + x @ [[30, 10], [10, 20]]
+    >>> fit = jaximp.fit_stiffness(x, v, torque)
+    >>> print(fit.K.round(1))
+    [[30. 10.]
+     [10. 20.]]
+
+    ```
     """
     return fit_triangles(*_trials(displacement, velocity, torque, valid), damping=damping)
 

@@ -36,7 +36,18 @@ CHUNK = 2_000_000
 
 
 class Posterior(eqx.Module):
-    """Draws from a posterior by C chains (or walkers) of N draws each, with what says whether they can be trusted."""
+    """Draws from a posterior by C chains (or walkers) of N draws each, with what says whether they can be trusted.
+
+    **Example:**
+
+    ```pycon
+    >>> log_density = lambda theta: -0.5 * ((theta - 2) ** 2).sum()
+    >>> found = jaximp.sample_posterior(log_density, np.zeros(1), names=["stiffness"], units=["N m/rad"], ess=200)
+    >>> print(found.names, found.chains.shape[2])
+    ('stiffness',) 1
+
+    ```
+    """
 
     chains: Float[AnyArray, "C N p"]
     """Draws of the parameters, in `units`."""

@@ -74,6 +74,16 @@ def sample_posterior(
     density that becomes NaN or infinite, or a file that holds another model's chain, which stays as it is.
 
     **Source:** Foreman-Mackey et al. 2013; ter Braak 2006; Goodman and Weare 2010 on when to stop.
+
+    **Example:**
+
+    ```pycon
+    >>> log_density = lambda theta: -0.5 * ((theta - 2) ** 2).sum()
+    >>> found = jaximp.sample_posterior(log_density, np.zeros(1), names=["stiffness"], units=["N m/rad"], ess=200)
+    >>> print(found["stiffness"].mean().round(0))
+    2.0
+
+    ```
     """
     require_float64(*(() if start is None else (start,)))
     start, covariance = _given(log_density, start, covariance)

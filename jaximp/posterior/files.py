@@ -224,6 +224,21 @@ def save_posterior(path: str | Path, posterior: Posterior | PosteriorMany, windo
     """Write NetCDF that `arviz.from_netcdf` reads; see `to_inference_data`.
 
     **Raises:** ValueError where the file cannot be written.
+
+    **Example:**
+
+    ```pycon
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> log_density = lambda theta: -0.5 * ((theta - 2) ** 2).sum()
+    >>> found = jaximp.sample_posterior(log_density, np.zeros(1), names=["stiffness"], units=["N m/rad"], ess=200)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaximp.save_posterior(Path(folder, "draws.nc"), found)
+    ...     print(jaximp.load_posterior(Path(folder, "draws.nc")).names)
+    ...
+    ('stiffness',)
+
+    ```
     """
     data = to_inference_data(posterior, windows)
     _whole(Path(path), lambda draft: data.to_netcdf(str(draft), engine="h5netcdf"))
@@ -233,6 +248,21 @@ def load_posterior(path: str | Path) -> Posterior:
     """One posterior from a file that `save_posterior` wrote, with its diagnostics computed anew.
 
     **Raises:** ValueError where there is no such file, or it holds something else.
+
+    **Example:**
+
+    ```pycon
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> log_density = lambda theta: -0.5 * ((theta - 2) ** 2).sum()
+    >>> found = jaximp.sample_posterior(log_density, np.zeros(1), names=["stiffness"], units=["N m/rad"], ess=200)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaximp.save_posterior(Path(folder, "draws.nc"), found)
+    ...     print(jaximp.load_posterior(Path(folder, "draws.nc")).names)
+    ...
+    ('stiffness',)
+
+    ```
     """
     import xarray as xr
 

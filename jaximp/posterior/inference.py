@@ -102,6 +102,14 @@ class Inference(Result):
     """What a recording tells of the parameters, in draws.
 
     As a result it is that of the whole record: means and standard deviations of the draws, and credible intervals.
+
+    **Example:**
+
+    ```pycon
+    >>> found = jaximp.infer(jaximp.read_job("examples/ankle.toml"))  # doctest: +SKIP
+    >>> print(found.whole.names, found.windows is not None)  # doctest: +SKIP
+
+    ```
     """
 
     whole: Posterior
@@ -400,6 +408,19 @@ def compare_models(first: Inference, second: Inference) -> tuple[float, float]:
 
     The mean difference of the log predictive density per row, over rows that count for both: of the same recording
     through the same filters. Every model has its own size of noise, and no autoregression.
+
+    **Example:**
+
+    ```pycon
+    >>> from pathlib import Path  # doctest: +SKIP
+    >>> text = Path("examples/ankle.toml").read_text()  # doctest: +SKIP
+    >>> without = text.replace("human = true", "human = { offset = false }")  # doctest: +SKIP
+    >>> first = jaximp.infer(jaximp.parse_job(text, Path("examples")))  # doctest: +SKIP
+    >>> second = jaximp.infer(jaximp.parse_job(without, Path("examples")))  # doctest: +SKIP
+    >>> gain, stderr = jaximp.compare_models(first, second)  # doctest: +SKIP
+    >>> print(gain > 2 * stderr)  # doctest: +SKIP
+
+    ```
     """
     if first.held_out is None or second.held_out is None:
         raise ValueError("half of the record does not determine one of the models: there is no score to compare")

@@ -90,6 +90,17 @@ def load_recording(
     **Returns:** the recording on a uniform grid; see `recording_from_arrays` for sampling, gaps and NaN.
 
     **Raises:** `FileNotFoundError`; else `ValueError` with one line that names the file, the cause and the remedy.
+
+    **Example:**
+
+    ```pycon
+    >>> columns = {"time": {"column": "t", "unit": "s"}, "position": {"column": "angle", "unit": "deg"}}
+    >>> torque = {"column": "moment", "unit": "N m", "sign": -1}
+    >>> recording = jaximp.load_recording("examples/ankle.csv", **columns, torque=torque)
+    >>> print(recording.sample_rate, np.ptp(recording.position).round(2))
+    500.0 0.15
+
+    ```
     """
     entries: dict[str, Any] = {"position": position, "torque": torque, "velocity": velocity, "force": force}
     entries |= {"acceleration": acceleration, "reference": reference, "command": command, "time": time}
@@ -161,6 +172,17 @@ def recording_from_arrays(
 
     **Raises:** `ValueError` for stamps that do not increase, infinite values, a signal that is constant or all NaN,
     fewer than 3 samples, shapes that do not match, or a gap that would make the grid 50 times as long as the data.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 4, 0.005)
+    >>> q = 0.1 * np.sin(9 * t)
+    >>> recording = jaximp.recording_from_arrays(t, q, torque=20 * q)
+    >>> print(recording.position.shape, recording.sample_rate)
+    (800, 1) 200.0
+
+    ```
     """
     arrays = zip(CHANNELS, (position, torque, velocity, acceleration, force, reference, command), strict=True)
     signals = {channel: stack((channel,), {channel: values}) for channel, values in arrays if given(channel, values)}

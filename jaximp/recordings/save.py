@@ -25,6 +25,21 @@ def save_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     which whoever reads it must see. The file appears whole or not at all.
 
     **Raises:** `ValueError` for another extension.
+
+    **Example:**
+
+    ```pycon
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> t = np.arange(0, 4, 0.005)
+    >>> recording = jaximp.recording_from_arrays(t, np.sin(t), np.cos(t))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaximp.save_recording(recording, Path(folder, "knee.csv"))
+    ...     print(Path(folder, "knee.csv").read_text().splitlines()[0])
+    ...
+    "time_s","position_rad","torque_Nm"
+
+    ```
     """
     _write_columns(_named_columns(recording), Path(path))
 

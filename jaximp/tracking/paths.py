@@ -81,6 +81,19 @@ def track(
 
     **Source:** Rauch, Tung and Striebel 1965; Durbin and Koopman, Time series analysis by state space methods, 2012;
     jumps: de Jong and Penzer 1998; see `tracking.drift` for the average over models.
+
+    **Example:**
+
+    ```pycon
+    >>> t = np.arange(0, 10, 0.05)
+    >>> W = np.column_stack([np.cos(9 * t), np.sin(5 * t)])
+    >>> y = W[:, 0] + (20 + t) * W[:, 1] + 0.1 * np.random.default_rng(0).normal(size=len(t))
+    >>> drift = np.array([0.0, 1.0])  # by default from the likelihood
+    >>> found = jaximp.track(W, y, grid=0.2, sample_rate=20, drift=drift, jumps=False, names=("damping", "stiffness"))
+    >>> print(found["stiffness"].value[[0, -1]].round(0))
+    [20. 30.]
+
+    ```
     """
     require_numbers("track", "give drift sizes to smoothed_path", W, y, valid, drift)
     require_float64(W, y)

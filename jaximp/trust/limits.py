@@ -8,7 +8,17 @@ from typing import Any
 
 @dataclass(frozen=True)
 class TrustLimits:
-    """What a window must keep to be trusted."""
+    """What a window must keep to be trusted.
+
+    **Example:**
+
+    ```pycon
+    >>> limits = jaximp.TrustLimits(max_relative_stderr=0.1)
+    >>> print(limits.max_relative_stderr, limits.max_residual_ratio)
+    0.1 4.0
+
+    ```
+    """
 
     min_vaf: float | None = None
     """Share of the torque's variance that the model must explain. By default 0.75, and any where the model is tested
