@@ -54,8 +54,8 @@ def identify(
     >>> recording = jaximp.read_job("examples/ankle.toml").load()
     >>> model, filters = jaximp.models.HumanJoint(), {"position_cutoff": 90, "decimation_cutoff": 45}
     >>> (found,) = jaximp.identify(recording, model=model, window_s=2, **filters)
-    >>> print(found.changed["stiffness"].partition(", p")[0])
-    60 until 12 s, then 120 N m/rad
+    >>> print(found.changed["stiffness"].how)
+    60 until 12 s, then 120
 
     ```
     """
