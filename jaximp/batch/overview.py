@@ -60,7 +60,8 @@ class GroupMean:
     recordings: int
     """How many have a mean of their own, and count."""
     left_out: int
-    """How many do not: failed, without a trusted window, or without a subject where there are subjects."""
+    """How many do not: failed, without a trusted window, suspected of other units, or without a subject where there
+    are subjects."""
     subjects: int | None
     """How many subjects the recordings come from; None where the recordings themselves are averaged."""
     mean: float
@@ -144,19 +145,23 @@ def group_means(recordings: pa.Table, groups: Sequence[str], parameter: str) -> 
     of one person are no independent draws from all people. s is the standard deviation between the n, so that it holds
     their true differences as well as the errors of estimation, and no standard error of a single fit is needed.
 
+    A recording with a `suspicion`, such as of other units, stays out.
+
     **Arguments:** `recordings` as for `write_overview`; `groups` names of columns, none for a mean over everything.
 
     **Returns:** the groups in the order of their values.
     """
     units = [name for name in ("subject",) if name in recordings.column_names and name not in groups]
     columns = [recordings.column(name).to_pylist() for name in [*groups, *units, "status", f"{parameter}_mean"]]
+    known = "suspicion" in recordings.column_names
+    suspicions = recordings.column("suspicion").to_pylist() if known else [""] * len(recordings)
     found: dict[tuple[Any, ...], list[tuple[Any, float]]] = {}
     left_out: Counter[tuple[Any, ...]] = Counter()
     for row, cells in enumerate(zip(*columns, strict=True)):
         group, unit = cells[: len(groups)], cells[len(groups)] if units else row
         status, mean = cells[-2:]
         found.setdefault(group, [])
-        if status == OK and unit is not None and mean is not None and math.isfinite(mean):
+        if status == OK and unit is not None and mean is not None and math.isfinite(mean) and not suspicions[row]:
             found[group].append((unit, mean))
         else:
             left_out[group] += 1
@@ -224,7 +229,7 @@ def _columns(recordings: pa.Table, parameter: str | None) -> list[dict[str, Any]
         found[MOST] = _column(MOST, pa.chunked_array([pa.array(most, pa.string())]), "")
     found["recording"]["choices"] = False
     first = ["recording", f"{parameter}_mean", f"{parameter}_sd", "status", MOST, "reason"]
-    others = [name for name in found if name not in first and name != "file"]
+    others = [name for name in found if name not in (*first, "file", "suspicion")]  # a suspicion is told as the reason
     return [found[name] for name in [*first, *others, "file"] if name in found]
 
 

@@ -267,13 +267,37 @@ def _write_tables(task: Task, batch: Batch, results: Sequence[Result]) -> dict[s
             path = "/".join(filter(None, (folder, partition, name)))
             tables[path] = windows_table(task, members, k)
     for path, table in tables.items():
-        buffer = pa.BufferOutputStream()
-        texts = [column.name for column in table.schema if column.type == pa.string()]
-        pq.write_table(table, buffer, use_dictionary=texts, compression="zstd")
-        content = buffer.getvalue().to_pybytes()
-        write_whole(task.out / path, content)
-        written[path] = checksum(content)
+        written[path] = _write_table(task.out / path, table)
     return written
+
+
+def _write_table(path: Path, table: pa.Table) -> str:
+    """Returns the file's checksum."""
+    buffer = pa.BufferOutputStream()
+    texts = [column.name for column in table.schema if column.type == pa.string()]
+    pq.write_table(table, buffer, use_dictionary=texts, compression="zstd")
+    content = buffer.getvalue().to_pybytes()
+    write_whole(path, content)
+    return checksum(content)
+
+
+def write_suspicions(out: Path, suspicions: Mapping[str, str]) -> None:
+    """Say in the recordings' tables what only all of them together tell; receipts hold the new checksums.
+
+    A run that is broken off in between finds a table that is not that of its receipt, and does the batch again.
+    """
+    for path in sorted((out / "recordings").glob("batch-*.parquet")):
+        table = pq.ParquetFile(path).read()
+        said = [suspicions.get(name, "") for name in table["recording"].to_pylist()]
+        if said == table["suspicion"].to_pylist():
+            continue
+        place = table.column_names.index("suspicion")
+        table = table.set_column(place, table.schema.field(place), pa.array(said, pa.string()))
+        sha256 = _write_table(path, table)
+        receipt_file = out / "receipts" / f"{path.stem}.json"
+        receipt = json.loads(receipt_file.read_text(encoding="utf-8"))
+        receipt["outputs"][f"recordings/{path.name}"] = sha256
+        write_whole(receipt_file, (json.dumps(receipt, indent=1) + "\n").encode())
 
 
 # --- reports ----------------------------------------------------------------------------------------------------------

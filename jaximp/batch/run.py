@@ -36,6 +36,7 @@ from jaximp.batch.results import (
     report_holds,
     report_wanted,
     write_late_report,
+    write_suspicions,
 )
 from jaximp.batch.tables import RUN_COLUMNS, reserved_columns
 from jaximp.batch.task import Task, load
@@ -147,7 +148,7 @@ def run_plan(
     chosen = _checked_reports(reports, plan)
     _prepare_folder(out, resume, plan.items)
     task, outcome = Task.of(job, plan, out, chosen), Outcome(recordings=len(plan.items))
-    with _log(out, tell) as log, _signals_heard() as check:
+    with _alone_in(out), _log(out, tell) as log, _signals_heard() as check:
         log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
         left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
         try:
@@ -194,6 +195,7 @@ def _write_pages(task: Task, plan: Plan, earlier: Sequence[Item], outcome: Outco
     try:
         _write_late_reports(task, earlier, log)
         outcome.odd = write_page(task.out, plan.metadata, plan.partitions)
+        write_suspicions(task.out, outcome.odd)
         for name, why in outcome.odd.items():
             log({"event": "odd", "recording": name, "reason": why})
     except OSError as error:
@@ -255,6 +257,25 @@ def _prepare_folder(out: Path, resume: bool, items: Sequence[Item]) -> None:
         (out / MARK).touch()
     except OSError as error:
         raise ValueError(f"{out} cannot be written: {error.strerror}; choose another --out") from None
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    """No other run writes into the folder meanwhile. The system lets go of the lock, however a run ends; where it has
+    none, or the file system, nobody is kept out."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with (out / MARK).open("a") as mark:
+        try:
+            fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"another run writes into {out}: wait for it, or choose another --out") from None
+        except OSError:
+            pass
+        yield
 
 
 def _sweep(task: Task, plan: Plan, outcome: Outcome, log: Tell) -> list[Batch]:
@@ -369,6 +390,7 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
     odd = _odd(table, [name for name in parameters if name.endswith(SCALED)])
     names, reasons = table["recording"].to_pylist(), table["reason"].to_pylist()
     table = _with_texts(table, "reason", [odd.get(name, why) for name, why in zip(names, reasons, strict=True)])
+    table = _with_texts(table, "suspicion", [odd.get(name, "") for name in names])
     # One window has no spread, and nothing over time: its interval is told instead.
     several = any(windows > 1 for windows in table["windows"].to_pylist())
     left_out = ("_median_stderr", "_half_width_95" if several else "_sd")

@@ -70,6 +70,7 @@ def recordings_table(task: Task, results: Sequence[Result]) -> pa.Table:
     columns += [
         ("status", "", _texts(result.status for result in results)),
         ("reason", "", _texts(result.remark for result in results)),
+        ("suspicion", "", _texts("" for _ in results)),  # what the others say of it, when all are there
         ("samples", "1", np.array([0 if r is None else r.samples for r in measured])),
         ("sample_rate_hz", "Hz", _numbers(r and r.sample_rate for r in measured)),
         ("duration_s", "s", _numbers(r and r.duration for r in measured)),

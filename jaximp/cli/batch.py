@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from jaximp.cli.signals import Stopped
 from jaximp.cli.terminal import JobFile, console
 
 if TYPE_CHECKING:
@@ -79,12 +79,13 @@ def _say_failures(outcome: Outcome, out: Path) -> None:
 
 
 def _say_outcome(outcome: Outcome, out: Path, resumed: bool) -> None:
-    done = outcome.recordings - len(outcome.failed)
-    typer.echo(
-        f"{done} of {outcome.recordings} recordings identified, {outcome.trusted} of {outcome.windows} windows trusted"
-    )
+    identified, left = outcome.done - len(outcome.failed), outcome.recordings - outcome.done
+    windows = f"{outcome.trusted} of {outcome.windows} windows trusted"
+    typer.echo(f"{identified} of {outcome.recordings} recordings identified, {windows}")
+    if left:
+        typer.echo(f"unfinished: {left} recordings are not done; run again with --resume")
     if resumed:
-        typer.echo(f"{outcome.skipped} were done already, {outcome.recordings - outcome.skipped} were done now")
+        typer.echo(f"{outcome.skipped} were done already, {outcome.done - outcome.skipped} were done now")
     if outcome.dropped:
         typer.echo(f"{outcome.dropped} of an earlier run are not among them: their results were removed")
     if outcome.outdated:
@@ -100,19 +101,12 @@ def _say_outcome(outcome: Outcome, out: Path, resumed: bool) -> None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM ends a batch as Ctrl-C does: what is done stays, `--resume` does the rest."""
-
-    def stop(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, stop)
+    """What is done stays when a signal ends a batch, and `--resume` does the rest."""
     try:
         yield
-    except KeyboardInterrupt:
-        console.print("interrupted: run again with --resume")
-        raise SystemExit(130) from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    except Stopped:
+        console.print("what is done is kept: run again with --resume")
+        raise
 
 
 @contextmanager

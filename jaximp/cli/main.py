@@ -26,6 +26,7 @@ from jaximp.cli.init import init
 from jaximp.cli.monitor import monitor
 from jaximp.cli.posterior import posterior
 from jaximp.cli.reproduce import reproduce
+from jaximp.cli.signals import Stopped, hear_signals, signals_obeyed
 from jaximp.cli.simulate import simulate
 from jaximp.cli.terminal import console
 
@@ -42,9 +43,14 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one line and exit status 1."""
+    """Run the command line; bad input ends in one line and exit status 1, a signal in another and its own status."""
+    hear_signals()
     try:
         app()
+    except Stopped as stopped:
+        signals_obeyed()
+        console.print("interrupted")
+        sys.exit(stopped.code)
     except (ValueError, OSError) as error:
         message = " ".join(str(error).split())
         console.print("[bold red]error:[/] ", end="")

@@ -18,6 +18,7 @@ from jaximp.batch import plan as batch_plan
 from jaximp.batch import results as batch_results
 from jaximp.batch import run as batch
 from jaximp.batch import tables as batch_tables
+from jaximp.batch.overview import group_means
 from jaximp.batch.plan import find_items, make_plan
 from jaximp.batch.task import Task
 from jaximp.jobs.job import WindowJob, parse_job, read_job
@@ -230,6 +231,15 @@ def test_other_units_are_noticed(tmp_path: Path) -> None:
     assert list(outcome.odd) == ["r0.parquet"]
     assert outcome.odd["r0.parquet"].startswith("stiffness is 0.017 times that of the median recording")
     assert "0.017 times" in (tmp_path / "out/overview.html").read_text()
+    recordings = batch.read_recordings(tmp_path / "out")
+    assert recordings["suspicion"].to_pylist() == [outcome.odd["r0.parquet"], *[""] * 5]
+    (mean,) = group_means(recordings, [], "stiffness")
+    assert (mean.recordings, mean.left_out) == (5, 1)
+    again = batch.run(parse_job(JOB), [tmp_path], tmp_path / "out", resume=True)
+    assert (again.skipped, again.odd) == (6, outcome.odd), "receipts know what was added to the tables"
+    fewer = batch.run(parse_job(JOB), [tmp_path / f"r{k}.parquet" for k in range(4)], tmp_path / "out", resume=True)
+    assert fewer.odd == {}
+    assert set(batch.read_recordings(tmp_path / "out")["suspicion"].to_pylist()) == {""}
     few = batch.run(parse_job(JOB), [tmp_path / f"r{k}.parquet" for k in range(4)], tmp_path / "few")
     assert few.odd == {}
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -330,3 +331,29 @@ def test_sigterm_ends_a_run_cleanly(study: Path, tmp_path: Path) -> None:
     assert not list((tmp_path / "out").rglob(f"*{UNFINISHED}"))
     assert run(study, tmp_path / "out", resume=True).exit_status == 0
     assert content(tmp_path / "out") == content(study / "reference")
+
+
+def test_a_second_run_into_the_folder_is_refused_and_a_dead_one_keeps_nobody_out(study: Path, tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    out, refused = tmp_path / "out", list[str]()
+
+    def run_again(event: dict[str, Any]) -> None:
+        if event["event"] == "plan" and not refused:
+            with pytest.raises(ValueError, match="another run writes into") as error:
+                run(study, out, resume=True)
+            refused.append(str(error.value))
+
+    assert run(study, out, tell=run_again).exit_status == 0
+    assert refused == [f"another run writes into {out}: wait for it, or choose another --out"]
+    assert run(study, out, resume=True).skipped == len(LENGTHS)
+
+
+def test_an_unfinished_run_does_not_say_that_all_were_identified(capsys: pytest.CaptureFixture[str]) -> None:
+    from jaximp.batch.run import Outcome
+    from jaximp.cli import batch as command
+
+    broken = Outcome(recordings=24, done=16, failed=[{"recording": "a", "reason": "b"}], broken=["batch 2: no space"])
+    command._say_outcome(broken, Path("out"), resumed=False)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("15 of 24 recordings identified")
+    assert said[1] == "unfinished: 8 recordings are not done; run again with --resume"
