@@ -29,7 +29,7 @@ from jaximp.jobs.job import Job, TrialsJob, WindowJob
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.mapping import columns_of, is_number
 from jaximp.recordings.outputs import MARK
-from jaximp.recordings.readers.formats import FORMATS, count_samples
+from jaximp.recordings.readers.formats import FORMATS, count_samples, format_of
 from jaximp.recordings.readers.text import delimiter_of
 from jaximp.types import listed
 
@@ -218,7 +218,7 @@ def _recordings_in(folder: Path) -> list[Path]:
     paths = [Path(where) / name for where, _, names in os.walk(folder, onerror=unreadable) for name in names]
     paths = [path for path in paths if not _in_results(path, folder)]
     shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
-    return sorted(path for path in shown if path.suffix.lower() in FORMATS)
+    return sorted(path for path in shown if format_of(path) is not None)
 
 
 def _in_results(path: Path, below: Path = Path()) -> bool:

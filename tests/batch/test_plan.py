@@ -41,6 +41,12 @@ def test_results_are_no_recordings(study: Path, monkeypatch: pytest.MonkeyPatch)
         assert names == {f"r{k}.parquet" for k in range(len(LENGTHS))}
 
 
+def test_packed_text_in_a_folder_is_a_recording(tmp_path: Path) -> None:
+    for name in ("a.csv", "b.csv.gz", "c.TXT", "notes.gz.md", "d.parquet.gz", "e.tar.gz"):
+        (tmp_path / name).touch()
+    assert [item.name for item in find_items([str(tmp_path)])] == ["a.csv", "b.csv.gz", "c.TXT"]
+
+
 @pytest.mark.parametrize("path", ["../r0.parquet", "/etc/passwd", "away/r0.parquet", "x/../../r0.parquet"])
 def test_a_manifest_cannot_leave_its_folder(tmp_path: Path, path: str) -> None:
     inside = tmp_path / "inside"

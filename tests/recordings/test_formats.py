@@ -16,6 +16,7 @@ import pytest
 
 from factories.recordings import MAPPING, matches, signals
 from jaximp.recordings import load_recording
+from jaximp.recordings.readers.contents import columns_in
 from jaximp.recordings.readers.formats import count_samples
 
 COLUMNS = signals()
@@ -120,6 +121,7 @@ def test_excel(tmp_path: Path) -> None:
     assert_columns(other, 2.0)
     assert_columns(load_recording(tmp_path / "a.xlsx", time=1, position=2, torque=3), DEG, 1e-15)
     assert count_samples(tmp_path / "a.xlsx", ["t"]) >= 50
+    assert list(columns_in(tmp_path / "a.xlsx")) == ["t", "q (deg)", "tau"]
     with pytest.raises(ValueError, match=matches("sheet 'Trial 3' is not there; did you mean")):
         load_recording(tmp_path / "a.xlsx", time="Trial 3!t", position="Trial 3!q", torque="Trial 3!tau")
 
@@ -154,6 +156,8 @@ def test_c3d(tmp_path: Path) -> None:
     assert "points come at 100 Hz and analog channels at 500 Hz: each point is held" in recording.notes
     assert any("changes only every 5 samples" in note for note in recording.notes)
     assert count_samples(tmp_path / "a.c3d", ["Mz"]) == 250
+    points = [f"{name}.{axis}" for name in ("HEEL", "RAnkleAngles") for axis in "xyz"]
+    assert list(columns_in(tmp_path / "a.c3d")) == ["time", "Mz", "EMG", *points]
     with pytest.raises(ValueError, match=matches("column 'Mx' is not there; there are: 'time', 'Mz'")):
         load_recording(tmp_path / "a.c3d", time="time", position="RAnkleAngles.x", torque="Mx")
 
@@ -215,6 +219,9 @@ def test_ros(tmp_path: Path, kind: str) -> None:
     assert joined.notes[0] == "time is that of /joint_states"
     assert joined.notes[1].startswith("/ft/wrench is joined on it, linearly between its 100 messages")
     assert count_samples(path, list(mapping.values())) == 50
+    states = [f"{topic}.{what}.{joint}" for what in ("position", "velocity", "effort") for joint in ("elbow", "ankle")]
+    wrench = [f"/ft/wrench.wrench.{what}.{axis}" for what in ("force", "torque") for axis in "xyz"]
+    assert set(columns_in(path)) == {"time", *states, *wrench}
     with pytest.raises(
         ValueError, match=matches("'position.knee' of /joint_states is not there; there are: 'elbow', 'ankle'")
     ):

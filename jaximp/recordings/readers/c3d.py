@@ -93,6 +93,13 @@ def _unit(file: Any, kind: str, label: str, analogs: Sequence[str]) -> str:
     return ""
 
 
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Channels by their labels, and of each point its three columns."""
+    file = library("ezc3d", "ezc3d", path.suffix).c3d(str(path))
+    points = [f"{point}.{axis}" for point in _labels(file, "POINT") for axis in AXES]
+    return dict.fromkeys(["time", *_labels(file, "ANALOG"), *points], ())
+
+
 def count(path: Path, names: Sequence[str]) -> int:
     """From the header, which is as long as a block."""
     with path.open("rb") as file:

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from jaximp.recordings.errors import RecordingError
-from jaximp.recordings.readers import hdf5, mat, npz, parquet, text
+from jaximp.recordings.readers import c3d, excel, hdf5, json_lines, mat, npz, parquet, rosbag, text
 from jaximp.recordings.readers.disguise import refuse_disguise
 from jaximp.recordings.readers.formats import FORMATS, format_of
 
 SHAPES = {
     text.read: text.shapes, parquet.read: parquet.shapes, mat.read: mat.shapes, hdf5.read: hdf5.shapes,
-    npz.read: npz.shapes,
+    npz.read: npz.shapes, parquet.read_feather: parquet.shapes_of_feather, json_lines.read: json_lines.shapes,
+    excel.read: excel.shapes, c3d.read: c3d.shapes, rosbag.read: rosbag.shapes,
 }  # fmt: skip
 """By the reader of a format."""
 

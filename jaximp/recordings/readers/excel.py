@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.columns import require
 from jaximp.recordings.readers.found import AS_SEEN, Found, TextOptions
 from jaximp.recordings.readers.library import library
-from jaximp.recordings.readers.text import read_text
+from jaximp.recordings.readers.text import read_text, shapes_in_text
 
 
 def read(path: Path, names: Sequence[str | int], options: TextOptions = AS_SEEN) -> Found:
@@ -47,13 +48,27 @@ def _first_readable(
 ) -> tuple[str, Found]:
     first: RecordingError | None = None
     for sheet in sheets:
-        rows = book.get_sheet_by_name(sheet).to_python(skip_empty_area=False)
-        text = "\n".join("\t".join(map(_cell, row)) for row in rows) + "\n"
         try:
-            return sheet, read_text(memoryview(text.encode()), names, options)
+            return sheet, read_text(_as_text(book, sheet), names, options)
         except RecordingError as error:
             first = first or error
     raise first or RecordingError("holds no sheet")
+
+
+def _as_text(book: Any, sheet: str) -> memoryview:
+    rows = book.get_sheet_by_name(sheet).to_python(skip_empty_area=False)
+    return memoryview(("\n".join("\t".join(map(_cell, row)) for row in rows) + "\n").encode())
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """What the columns of the first sheet with several of them are called."""
+    book = library("python_calamine", "python-calamine", path.suffix).CalamineWorkbook.from_path(path)
+    for sheet in book.sheet_names:
+        with suppress(RecordingError):
+            found = shapes_in_text(_as_text(book, sheet))
+            if len(found) > 1:
+                return found
+    raise RecordingError("holds no sheet with columns of numbers")
 
 
 def _cell(value: Any) -> str:

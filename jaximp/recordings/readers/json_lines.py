@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaximp.recordings.readers.found import Found
-from jaximp.recordings.readers.parquet import columns_of_table
+from jaximp.recordings.readers.parquet import columns_of_table, shapes_in_schema
 
 
 def read(path: Path, names: Sequence[str]) -> Found:
@@ -14,6 +14,14 @@ def read(path: Path, names: Sequence[str]) -> Found:
 
     with path.open("rb") as file:
         return columns_of_table(json.read_json(file), names)
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Keys whose values are numbers."""
+    from pyarrow import json
+
+    with path.open("rb") as file:
+        return shapes_in_schema(json.read_json(file).schema)
 
 
 def count(path: Path, names: Sequence[str]) -> int:

@@ -119,9 +119,22 @@ def count(path: Path, names: Sequence[str]) -> int:
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """The columns of numbers; how many a column of lists holds only its rows say."""
-    from pyarrow import parquet, types
+    from pyarrow import parquet
 
-    schema = parquet.read_schema(path)
+    return shapes_in_schema(parquet.read_schema(path))
+
+
+def shapes_of_feather(path: Path) -> dict[str, tuple[int, ...]]:
+    """The same of a Feather file."""
+    from pyarrow import dataset
+
+    return shapes_in_schema(dataset.dataset(path, format="feather").schema)
+
+
+def shapes_in_schema(schema: Any) -> dict[str, tuple[int, ...]]:
+    """Columns of numbers and of time stamps."""
+    from pyarrow import types
+
     return {
         field.name: ()
         for field in schema

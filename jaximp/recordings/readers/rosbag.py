@@ -7,7 +7,7 @@ Of `sensor_msgs/JointState` a joint is called by its name. Every topic has a clo
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from jaximp.types import Numbers
 JOINT_FIELDS = ("position", "velocity", "effort")
 GAP = 2.5
 """A topic is not joined across so many of its usual intervals."""
+MOST_PLACES = 100
+"""An array of a message that holds more numbers is no list of joints."""
 
 
 def read(path: Path, names: Sequence[str]) -> Found:
@@ -113,6 +115,34 @@ def _joined(at: Numbers, stamps: Numbers, values: Numbers) -> Numbers:
         wide = stamps[after] - stamps[after - 1] > GAP * np.median(np.diff(stamps))
         joined[wide & (at > stamps[after - 1]) & (at < stamps[after])] = np.nan
     return joined
+
+
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """What the first message of every topic holds; of the parts of a joint state each joint by its name."""
+    with _opened(path) as bag:
+        found, seen = ["time"], set[str]()
+        for connection, _, raw in bag.messages():
+            if connection.topic not in seen:
+                seen.add(connection.topic)
+                message = bag.deserialize(raw, connection.msgtype)
+                found += _numbers_in(message, connection.topic, list(getattr(message, "name", []) or []))
+            if len(seen) == len({one.topic for one in bag.connections if one.msgcount}):
+                break
+    return dict.fromkeys(found, ())
+
+
+def _numbers_in(value: Any, name: str, joints: Sequence[str]) -> Iterator[str]:
+    """Names of the numbers in a message, or in a part of it."""
+    if isinstance(value, int | float | np.number):
+        yield name
+    elif isinstance(value, np.ndarray | list | tuple):
+        if len(value) <= MOST_PLACES and all(isinstance(one, int | float | np.number) for one in value):
+            for k in range(len(value)):
+                yield f"{name}.{joints[k]}" if k < len(joints) else f"{name}[{k + 1}]"
+    else:
+        for part in getattr(value, "__dataclass_fields__", {}):
+            if part != "header" and not part.startswith("_"):
+                yield from _numbers_in(getattr(value, part), f"{name}.{part}", joints)
 
 
 def count(path: Path, names: Sequence[str]) -> int:

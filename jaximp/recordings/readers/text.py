@@ -407,7 +407,12 @@ def count(path: Path, names: Sequence[str | int]) -> int:
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """What the columns of a file are called: names, or numbers from 1 where it has no header."""
-    content, _ = _decoded(_bytes_of(path), AS_SEEN)
+    return shapes_in_text(_bytes_of(path))
+
+
+def shapes_in_text(raw: Any) -> dict[str, tuple[int, ...]]:
+    """The same of a file's bytes."""
+    content, _ = _decoded(raw, AS_SEEN)
     layout = layout_of(_first_lines(content), AS_SEEN)
     names = layout.names or tuple(map(str, range(1, layout.width + 1)))
     return dict.fromkeys(names, ())
