@@ -26,6 +26,7 @@ import numpy as np
 
 from jaximp.identification.solving import stack_size
 from jaximp.jobs.job import Job, TrialsJob, WindowJob
+from jaximp.recordings.apart import files_apart
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.mapping import columns_of, is_number
 from jaximp.recordings.outputs import MARK
@@ -352,6 +353,8 @@ def of_recordings(job: Job) -> WindowJob:
         raise ValueError("a job with [trials] is one study by itself: batch works on jobs with [recording]")
     if job.payload is not None:
         raise ValueError("a job with [payload] is about one pair of recordings: run `jaximp identify` on it")
+    if files_apart(job.recording):
+        raise ValueError("a batch reads one file per recording, and this job names others for single channels")
     if job.left_out:
         tables = listed([f"[{name}]" for name in job.left_out])
         none = " (an empty [filter] is none)" if "filter" in job.left_out else ""

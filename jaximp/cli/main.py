@@ -50,7 +50,8 @@ def main() -> None:
     except Stopped as stopped:
         signals_obeyed()
         console.print("interrupted")
-        sys.exit(stopped.code)
+        sys.stdout.flush()
+        os._exit(int(stopped.code or 0))  # all is cleaned up; threads that still compile would crash while Python ends
     except (ValueError, OSError) as error:
         message = " ".join(str(error).split())
         console.print("[bold red]error:[/] ", end="")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import signal
+import sys
 import threading
 import weakref
 from typing import Any
@@ -22,6 +23,9 @@ def hear_signals() -> None:
     """Raise `Stopped` on SIGINT and SIGTERM; a signal that is ignored stays so, as in a job in the background."""
     if threading.current_thread() is not threading.main_thread():
         return
+    say = sys.unraisablehook
+    # One that is dropped is raised again, and nobody need read of it.
+    sys.unraisablehook = lambda about: None if isinstance(about.exc_value, Stopped) else say(about)
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)

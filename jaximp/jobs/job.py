@@ -28,6 +28,7 @@ from jaximp.models.reflex import ReflexPathway
 from jaximp.motion.trajectories import FourierSeries
 from jaximp.posterior.inference import PosteriorSettings
 from jaximp.posterior.priors import LogNormal, Normal
+from jaximp.recordings.apart import files_apart
 from jaximp.recordings.join import join_recordings, part_of
 from jaximp.recordings.load import recording_from_mapping, recordings_from_mapping
 from jaximp.trust import plausibility
@@ -229,6 +230,7 @@ class WindowJob:
         tables = [self.recording, *self.more_recordings, *(table for table in others if table is not None)]
         named = [table["file"] for table in tables if "file" in table]
         names = [str(name) for one in named for name in (one if isinstance(one, list) else [one])]
+        names += [name for table in tables for name in files_apart(table)]
         urdf = None if self.model.chain is None else self.model.chain.urdf
         return [self.folder / name for name in (*names, self.design, urdf) if name is not None]
 

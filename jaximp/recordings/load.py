@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaximp.recordings.apart import files_apart, found_in, joined, split_apart
 from jaximp.recordings.assemble import assemble
 from jaximp.recordings.channels import CHANNELS, Signal, check_lengths, stack
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import take_clock
 from jaximp.recordings.mapping import Entry, check_mapping, given, is_number, joint_types, source_of, text_options
 from jaximp.recordings.readers.formats import read_columns
-from jaximp.recordings.readers.found import AS_SEEN, TextOptions
+from jaximp.recordings.readers.found import AS_SEEN, COUNTED_FROM, TextOptions
 from jaximp.recordings.units import to_si
 from jaximp.types import Recording
 
@@ -76,6 +77,9 @@ def load_recording(
       each column, such as the torques that drives give for their currents. `gain_error`, of the torque alone, is what
       is not known of the gains, as standard deviations in per cent: `3` for each by itself, or
       `{common = 10, each = 3}` with what all have in common; standard errors grow by it.
+      A channel other than the position may stand in another file: `{file = "sensor.csv", time = "stamp", column =
+      "torque"}` joins it on the recording's time, linearly between its samples, both in seconds of one clock; without
+      `time` it has the same rows.
     - `joint`: `revolute` or `prismatic`, or a list of these, one per joint.
     - `gear_ratio`: motor turns per joint turn, if the columns were measured at the motor: position, velocity,
       acceleration and reference are divided by it, torque and command are multiplied; `force` acts at the endpoint and
@@ -108,8 +112,13 @@ def load_recording(
     written = {"header": header, "separator": separator, "decimal": decimal, "encoding": encoding}
     with _named(str(path)):
         options = text_options({**written, "bad_lines": bad_lines})
-        signals, joints, notes = _read_signals(path, entries, sample_rate, joint, gear_ratio, rows, options)
+        own, apart = split_apart(entries)
+        signals, joints, notes = _read_signals(path, own, sample_rate, joint, gear_ratio, rows, options)
         clock = take_clock(signals, sample_rate)
+        for channel, entry in apart.items():
+            signals[channel], said = _read_apart(channel, entry, clock, joints, gear_ratio)
+            notes += said
+        signals = {channel: signals[channel] for channel in CHANNELS if channel in signals}
         return assemble(clock, signals, joints, _stem(path) if name is None else name, notes, duplicates)
 
 
@@ -143,7 +152,9 @@ def recordings_from_mapping(
         rows = [rows] * len(files)
     if len(rows) != len(files):
         raise RecordingError(f"{where}: rows lists {len(rows)} pairs for {len(files)} files: give one, or one each")
-    mapping = {key: table[key] for key in table if key not in ("file", "rows")}
+    if len(files) > 1 and files_apart(table):
+        raise RecordingError(f"{where}: with channels in other files, 'file' is one recording: write several tables")
+    mapping = {key: entry for key, entry in found_in(table, Path(folder)).items() if key not in ("file", "rows")}
     return [load_recording(Path(folder) / file, **mapping, rows=pair) for file, pair in zip(files, rows, strict=True)]
 
 
@@ -250,6 +261,37 @@ def _read_signals(
             signals[key], taken = to_si(key, signal, sources[key], joints, gear_ratio, found)
             notes += taken
     return signals, joints, notes
+
+
+def _read_apart(
+    channel: str, entry: dict[str, Any], clock: Signal, joints: tuple[str, ...], gear_ratio: float
+) -> tuple[Signal, list[str]]:
+    """A channel of another file, in SI units and at the times of the recording, and notes on it."""
+    path, time = _existing(entry.pop("file")), entry.pop("time", None)
+    with _named(path.name):
+        sources = {channel: source_of(channel, entry)}
+        if time is not None:
+            sources["time"] = source_of("time", time)
+        found = read_columns(path, [column for source in sources.values() for column in source.columns], AS_SEEN)
+        signals, notes = {}, list(found.notes)
+        for key, source in sources.items():
+            signals[key], taken = to_si(key, stack(source.columns, found.values), source, joints, gear_ratio, found)
+            notes += taken
+    if time is None:
+        if len(signals[channel].values) != len(clock.values):
+            raise RecordingError(
+                f"{channel}: {path.name} has {len(signals[channel].values)} samples and the recording "
+                f"{len(clock.values)}: name the column with its times as 'time' in the channel's table"
+            )
+        return signals[channel], [*notes, f"{channel} is that of {path.name}, row by row"]
+    if any(COUNTED_FROM in note for note in found.notes) or path.suffix.lower() in (".bag", ".mcap", ".db3"):
+        raise RecordingError(
+            f"{channel}: the times of {path.name} count from its own beginning: write seconds of the recording's clock"
+        )
+    if clock.labels == ("sample_rate",):
+        raise RecordingError(f"{channel}: {path.name} has times of its own: name the recording's 'time', too")
+    signal, said = joined(channel, signals[channel], signals["time"], clock, path)
+    return signal, [*notes, *said]
 
 
 def _stem(path: Path) -> str:

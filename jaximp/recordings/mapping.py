@@ -79,8 +79,8 @@ def source_of(channel: str, entry: Any) -> Source:
     for key in options:
         if key == "file":
             raise RecordingError(
-                f"{channel}: all columns of a recording come from one file and have one time base; resample it at the "
-                "times of the others, and write both into one file"
+                f"{channel}: here all columns come from one file; a channel of [recording] alone, but the position, "
+                "may name another"
             )
         if key not in allowed:
             raise RecordingError(f"{channel}: unknown key {key!r}; {nearest(str(key), allowed)}")

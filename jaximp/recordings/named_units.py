@@ -8,7 +8,17 @@ from dataclasses import dataclass
 
 SUFFIXES = {
     **{unit: unit for unit in ("deg", "mrad", "rad", "mm", "cm", "m", "s", "ms", "us", "N", "V", "Hz", "kHz", "rpm")},
-    **{"Nm": "N m", "mNm": "mN m", "rad_s": "rad/s", "deg_s": "deg/s", "m_s": "m/s", "mm_s": "mm/s"},
+    **{
+        "Nm": "N m",
+        "mNm": "mN m",
+        "kNm": "kN m",
+        "Nmm": "N mm",
+        "Ncm": "N cm",
+        "rad_s": "rad/s",
+        "deg_s": "deg/s",
+        "m_s": "m/s",
+        "mm_s": "mm/s",
+    },
     **{"rad_s2": "rad/s^2", "deg_s2": "deg/s^2", "m_s2": "m/s^2"},
 }
 """What the end of a column's name says about its unit: `knee_deg`. Also names the columns that we write."""
@@ -43,8 +53,11 @@ SPELLINGS = {
     **{"um": "um", "µm": "um", "μm": "um", "%": "percent", "g": "g", "kg": "kg"},
 }
 """How units are written in files, and what pint calls them."""
-_CAMEL = re.compile(r"(?<=[a-z0-9])(Degrees|Degree|Deg|Radians|Rad|mNm|Nm|Ms|Rpm)$")
-_WORDS = ("deg", "degrees", "rad", "radians", "Nm", "mNm", "ms", "rpm", "seconds", "milliseconds")
+_CAMEL = re.compile(
+    r"(?<=[a-z0-9])(Ms)$|(?<=[a-z0-9_.\-/:])([Dd]egrees|[Dd]egree|Deg|[Rr]adians|[Rr]adian|Rad|mNm|kNm|Nmm|Ncm|Nm|Rpm)$"
+)
+"""The unit begins where the name of the quantity ends: the Nm of `torque_mNm` are no newton metres."""
+_WORDS = ("deg", "degrees", "rad", "radians", "Nm", "mNm", "kNm", "Nmm", "Ncm", "ms", "rpm", "seconds", "milliseconds")
 
 
 @dataclass(frozen=True)
@@ -82,6 +95,7 @@ def unit_in(name: str) -> Said | None:
         return Said(word, spelled(word))
     camel = _CAMEL.search(name)
     if camel:
-        return Said(camel[1], spelled(camel[1]) or spelled(camel[1].lower()))
+        text = camel[1] or camel[2]
+        return Said(text, spelled(text) or spelled(text.lower()))
     suffix = max((suffix for suffix in SUFFIXES if name.endswith("_" + suffix)), key=len, default=None)
     return Said(SUFFIXES[suffix], SUFFIXES[suffix]) if suffix else None

@@ -14,9 +14,11 @@ import pytest
 
 from paths import ROOT
 
-PROGRAM = [sys.executable, "-c", "from jaximp.cli.main import main; main()"]
-LOSES_IT = """
-import gc, signal, time
+HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+"""A job in the background of a shell ignores SIGINT, and so do its children."""
+PROGRAM = [sys.executable, "-c", f"{HEARD}from jaximp.cli.main import main; main()"]
+LOSES_IT = f"""{HEARD}
+import gc, time
 from jaximp.cli.signals import hear_signals
 hear_signals()
 def lose(phase, about):
@@ -29,11 +31,6 @@ gc.collect()
 print("lost", flush=True)
 time.sleep(60)
 """
-
-
-def heard() -> None:
-    """A shell's background job ignores SIGINT, and its children would."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
@@ -54,7 +51,7 @@ def test_a_command_ends_and_leaves_nothing_behind(command: str, number: signal.S
     before = sorted(os.listdir(tmp_path))
     arguments = [command, "ankle.toml"] + ([] if command == "check" else ["--out", "out"])
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen([*PROGRAM, *arguments], cwd=tmp_path, preexec_fn=heard, **pipes)
+    process = subprocess.Popen([*PROGRAM, *arguments], cwd=tmp_path, **pipes)
     for _ in range(600):
         if command == "check" or sorted(os.listdir(tmp_path)) != before:
             break
@@ -73,6 +70,6 @@ def test_a_command_ends_and_leaves_nothing_behind(command: str, number: signal.S
 def test_a_signal_that_python_drops_is_raised_again(number: signal.Signals) -> None:
     code = LOSES_IT.replace("NUMBER", f"signal.{number.name}")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    status, said, _ = ended(subprocess.Popen([sys.executable, "-c", code], preexec_fn=heard, **pipes))
+    status, said, _ = ended(subprocess.Popen([sys.executable, "-c", code], **pipes))
     assert said == "lost\n"
     assert status == 128 + number

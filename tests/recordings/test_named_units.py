@@ -31,6 +31,7 @@ def loaded(folder: Path, names: dict[str, str], row: str = "", **mapping: Any) -
     [
         *[(name, DEG) for name in ("angle (deg)", "angle [deg]", "angle (°)", "angleDeg", "knee_deg", "q [degrees]")],
         *[(name, DEG) for name in ("angle / deg", "angle deg", "Angle [°] left", "angle(deg)")],
+        *[(name, DEG) for name in ("knee_degrees", "kneeDegrees", "knee.degrees", "knee_Deg")],
         ("c1 position [rev]", 2 * np.pi),
         ("q (mrad)", 1e-3),
     ],
@@ -51,6 +52,10 @@ def test_a_named_unit_of_the_position_is_taken(tmp_path: Path, name: str, factor
         ("torque [Ncm]", 1e-2),
         ("M (kN m)", 1e3),
         ("T [in-lb]", 0.1129848),
+        *[(name, 1e-3) for name in ("torque_mNm", "torquemNm", "torque mNm", "log.torque-mNm", "tau_Nmm", "tauNmm")],
+        *[(name, 1e3) for name in ("torque_kNm", "torquekNm", "M:kNm")],
+        *[(name, 1e-2) for name in ("torque_Ncm", "tau Ncm")],
+        *[(name, 1.0) for name in ("torque_Nm", "torqueNm", "tau Nm")],
     ],
 )
 def test_a_named_unit_of_the_torque_is_taken(tmp_path: Path, name: str, factor: float) -> None:

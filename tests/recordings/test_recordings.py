@@ -314,8 +314,6 @@ def test_one_file_has_one_time_base(tmp_path: Path) -> None:
     columns: dict[str, Any] = {"sample_rate": 1000.0, "joint": "prismatic", "position": "q"}
     with pytest.raises(ValueError, match=r"'q\[1\]' has 99 samples, but 'f\[1\]' has 50; .*one time base"):
         load_recording(tmp_path / "t.npz", torque="f", **columns)
-    with pytest.raises(ValueError, match="all columns of a recording come from one file"):
-        load_recording(tmp_path / "t.npz", torque={"file": "other.npz", "column": "f"}, **columns)
 
 
 def test_a_command_is_a_force(tmp_path: Path) -> None:

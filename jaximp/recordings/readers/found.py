@@ -22,6 +22,10 @@ class Found:
     """How the file was understood, as far as that is not obvious."""
 
 
+COUNTED_FROM = "seconds are counted from"
+"""How the note on a clock ends that begins with the file."""
+
+
 @dataclass(frozen=True)
 class TextOptions:
     """What a mapping says of a text file, in place of what would be seen in it."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.columns import head_of, pick, require, steps_of
-from jaximp.recordings.readers.found import Found
+from jaximp.recordings.readers.found import COUNTED_FROM, Found
 
 THREADS_PAY = 200_000
 """Rows of a file from which its columns are read at the same time: to hand over small ones takes longer."""
@@ -62,19 +62,21 @@ def _check_kind(name: str, kind: Any) -> None:
 
 
 def _columns(table: Any, heads: dict[str, str]) -> Found:
+    import pyarrow
+
     notes: list[str] = []
     values = {}
     for name, head in heads.items():
         steps = [] if name == head else steps_of(name)[1]
         column = table[head].combine_chunks()
         while steps and isinstance(field := steps[0], str):
-            import pyarrow
-
             steps = steps[1:]
             if not pyarrow.types.is_struct(column.type):
                 raise RecordingError(f"column {name!r} is not there: {head!r} has no fields")
             require(field, [one.name for one in column.type], f"field {field!r} of {name!r}")
             column = column.field(field)
+        if pyarrow.types.is_timestamp(column.type) and len(column):
+            notes.append(f"{name!r} holds time stamps: {COUNTED_FROM} {column[0]}")
         values[name] = pick(_numbers(name, column), steps, name, notes)
     return Found(values, notes=tuple(notes))
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.readers.found import COUNTED_FROM
 from jaximp.types import Numbers
 
 _TIME = re.compile(
@@ -46,7 +47,7 @@ def seconds_of(label: str, texts: Sequence[str | None]) -> tuple[Numbers, str]:
         seconds[k] = (stamp - first + days * DAY) / 1e9
     midnight = f", past midnight {days} times" if days else ""
     start = next(text for text in texts if text is not None)
-    return seconds, f"{label!r} holds times of day: seconds are counted from {start}{midnight}"
+    return seconds, f"{label!r} holds times of day: {COUNTED_FROM} {start}{midnight}"
 
 
 def _nanoseconds(label: str, text: str) -> int:
