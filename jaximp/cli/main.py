@@ -30,6 +30,9 @@ from jaximp.cli.signals import Stopped, hear_signals, signals_obeyed
 from jaximp.cli.simulate import simulate
 from jaximp.cli.terminal import console
 
+MOST_CACHED = 500_000_000
+"""Bytes of compiled code that are kept for later runs."""
+
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -66,10 +69,26 @@ def prepare() -> None:
     jax.config.update("jax_enable_x64", True)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaximp"
     with suppress(OSError):
-        cache.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+        keep_small(cache)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and os.access(cache, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+
+
+def keep_small(cache: Path, most: int = MOST_CACHED) -> None:
+    """Delete the compiled code that was used least lately, where there is more than so many bytes of it.
+
+    Several processes may do so at a time: what another one has deleted is gone, and what it still needs is compiled.
+    """
+    files = [(entry.stat(), entry.path) for entry in os.scandir(cache) if entry.is_file()]
+    total = sum(about.st_size for about, _ in files)
+    for about, path in sorted(files, key=lambda file: max(file[0].st_atime, file[0].st_mtime)):
+        if total <= most:
+            return
+        with suppress(OSError):
+            os.unlink(path)
+        total -= about.st_size
 
 
 def prepared(command: Callable[..., None]) -> Callable[..., None]:

@@ -16,6 +16,7 @@ import command_line
 import jaximp
 from factories.joints import TIME, joint
 from jaximp import papers
+from jaximp.cli.main import keep_small
 from jaximp.cli.reproduce import Paper
 from jaximp.recordings.save import save_recording
 
@@ -255,3 +256,13 @@ def refused(run, job: Path, message: str) -> None:  # type: ignore[no-untyped-de
     assert complained.strip().count("\n") == 0
     assert message in complained
     assert {path.name for path in job.parent.iterdir()} == before
+
+
+def test_of_compiled_code_the_oldest_goes_where_there_is_much_of_it(tmp_path: Path) -> None:
+    for k in range(5):
+        (tmp_path / f"program{k}").write_bytes(bytes(100))
+        os.utime(tmp_path / f"program{k}", (1000 - k, 1000 - k))
+    keep_small(tmp_path, 1000)
+    assert len(os.listdir(tmp_path)) == 5
+    keep_small(tmp_path, 250)
+    assert sorted(os.listdir(tmp_path)) == ["program0", "program1"]
