@@ -288,6 +288,8 @@ def write_suspicions(out: Path, suspicions: Mapping[str, str]) -> None:
     """
     for path in sorted((out / "recordings").glob("batch-*.parquet")):
         table = pq.ParquetFile(path).read()
+        if "suspicion" not in table.column_names:  # of a version that did not have it
+            continue
         said = [suspicions.get(name, "") for name in table["recording"].to_pylist()]
         if said == table["suspicion"].to_pylist():
             continue

@@ -414,7 +414,9 @@ def write_page(out: str | Path, metadata: Sequence[str] = (), groups: Sequence[s
 
 
 def _with_texts(table: pa.Table, name: str, texts: Sequence[str | None]) -> pa.Table:
-    """The table with other texts in a column."""
+    """The table with other texts in a column, or with that column."""
+    if name not in table.column_names:
+        return table.append_column(pa.field(name, pa.string()), pa.array(texts, pa.string()))
     return table.set_column(table.column_names.index(name), table.schema.field(name), pa.array(texts, pa.string()))
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jaximp.cli.signals import Stopped
 from jaximp.cli.terminal import JobFile, console
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def batch(
             typer.echo(line)
         return
     chosen = reports[0] if reports and len(reports) == 1 else reports or "none"
-    with _interruptible(), _events(len(plan.items), quiet, json_lines) as tell:
+    with _events(len(plan.items), quiet, json_lines) as tell:
         outcome = run_plan(job, plan, out, workers, scheduler, resume, chosen, tell)
     if not json_lines:
         _say_failures(outcome, out)
@@ -100,16 +99,6 @@ def _say_outcome(outcome: Outcome, out: Path, resumed: bool) -> None:
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """What is done stays when a signal ends a batch, and `--resume` does the rest."""
-    try:
-        yield
-    except Stopped:
-        console.print("what is done is kept: run again with --resume")
-        raise
-
-
-@contextmanager
 def _events(total: int, quiet: bool, json_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar with rate, failures and time left; or lines of JSON; or nothing."""
     import json
@@ -127,6 +116,9 @@ def _events(total: int, quiet: bool, json_lines: bool) -> Iterator[Callable[[dic
         def tell(event: dict[str, Any]) -> None:
             if json_lines:
                 typer.echo(json.dumps(event))
+            if event["event"] == "interrupted":
+                kept = f"{event['done']} of {event['of']} recordings are done, and kept"
+                console.print(f"{kept}: run again with --resume", soft_wrap=True)
             if event["event"] == "resume":
                 bar.update(name, completed=event["skipped"])
             if event["event"] == "batch":
