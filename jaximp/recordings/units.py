@@ -45,7 +45,7 @@ def to_si(
         _Column(channel, label, unit, found or Found({})) for label, unit in zip(signal.labels, units, strict=True)
     ]
     factors, notes = zip(*(_unit_factor(source, column) for column in columns), strict=True)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         factor = np.array(factors) * source.sign * _for_each(channel, "gain", source.gain or (1.0,), signal) * gear
         values = signal.values * factor
     error = source.gain_error

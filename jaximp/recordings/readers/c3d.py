@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.readers.claims import check_c3d
 from jaximp.recordings.readers.columns import pick, require, steps_of
 from jaximp.recordings.readers.found import Found
 from jaximp.recordings.readers.library import library
@@ -23,7 +24,7 @@ KINDS = {"ANGLES": "ANGLE_UNITS", "MOMENTS": "MOMENT_UNITS", "FORCES": "FORCE_UN
 
 
 def read(path: Path, names: Sequence[str]) -> Found:
-    file = library("ezc3d", "ezc3d", path.suffix).c3d(str(path))
+    file = _opened(path)
     points, analogs = _labels(file, "POINT"), _labels(file, "ANALOG")
     of = {name: _place(name, points, analogs) for name in names}
     kinds = {kind for kind, _, _ in of.values()} - {"time"}
@@ -48,6 +49,12 @@ def read(path: Path, names: Sequence[str]) -> Found:
             values[name] = np.repeat(picked, ratio, axis=0)
     units = {name: _unit(file, kind, label, analogs) for name, (kind, label, _) in of.items()}
     return Found(values, units={name: unit for name, unit in units.items() if unit}, notes=tuple(notes))
+
+
+def _opened(path: Path) -> Any:
+    ezc3d = library("ezc3d", "ezc3d", path.suffix)
+    check_c3d(path)
+    return ezc3d.c3d(str(path))
 
 
 def _place(name: str, points: Sequence[str], analogs: Sequence[str]) -> tuple[str, str, list[Any]]:
@@ -95,7 +102,7 @@ def _unit(file: Any, kind: str, label: str, analogs: Sequence[str]) -> str:
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Channels by their labels, and of each point its three columns."""
-    file = library("ezc3d", "ezc3d", path.suffix).c3d(str(path))
+    file = _opened(path)
     points = [f"{point}.{axis}" for point in _labels(file, "POINT") for axis in AXES]
     return dict.fromkeys(["time", *_labels(file, "ANALOG"), *points], ())
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.readers.claims import check_workbook
 from jaximp.recordings.readers.columns import require
 from jaximp.recordings.readers.found import AS_SEEN, Found, TextOptions
 from jaximp.recordings.readers.library import library
@@ -20,7 +21,7 @@ from jaximp.recordings.readers.text import read_text, shapes_in_text
 
 
 def read(path: Path, names: Sequence[str | int], options: TextOptions = AS_SEEN) -> Found:
-    book = library("python_calamine", "python-calamine", path.suffix).CalamineWorkbook.from_path(path)
+    book = _opened(path)
     sheets = {str(name).partition("!")[0] for name in names if "!" in str(name)}
     if len(sheets) > 1:
         raise RecordingError(f"columns of the sheets {' and '.join(sorted(sheets))}: take all of them from one sheet")
@@ -43,6 +44,13 @@ def read(path: Path, names: Sequence[str | int], options: TextOptions = AS_SEEN)
     )
 
 
+def _opened(path: Path) -> Any:
+    calamine = library("python_calamine", "python-calamine", path.suffix)
+    if path.suffix.lower() == ".xlsx":
+        check_workbook(path)
+    return calamine.CalamineWorkbook.from_path(path)
+
+
 def _first_readable(
     book: Any, sheets: Sequence[str], names: Sequence[str | int], options: TextOptions
 ) -> tuple[str, Found]:
@@ -62,7 +70,7 @@ def _as_text(book: Any, sheet: str) -> memoryview:
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """What the columns of the first sheet with several of them are called."""
-    book = library("python_calamine", "python-calamine", path.suffix).CalamineWorkbook.from_path(path)
+    book = _opened(path)
     for sheet in book.sheet_names:
         with suppress(RecordingError):
             found = shapes_in_text(_as_text(book, sheet))
@@ -85,5 +93,5 @@ def _cell(value: Any) -> str:
 
 
 def count(path: Path, names: Sequence[str | int]) -> int:
-    book = library("python_calamine", "python-calamine", path.suffix).CalamineWorkbook.from_path(path)
+    book = _opened(path)
     return max(book.get_sheet_by_name(name).total_height for name in book.sheet_names)

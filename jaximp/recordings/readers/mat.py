@@ -12,6 +12,7 @@ import numpy as np
 
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers import hdf5
+from jaximp.recordings.readers.claims import MATRIX, MOST_AXES, check_elements
 from jaximp.recordings.readers.columns import head_of, largest, pick, require_variable, steps_of
 from jaximp.recordings.readers.found import Found
 from jaximp.recordings.readers.matlab_objects import column_of_object
@@ -89,6 +90,9 @@ def _walk(path: Path) -> tuple[int, dict[str, Variable]]:
         while position < size:
             file.seek(position)
             kind, length = (int.from_bytes(file.read(4), order) for _ in range(2))
+            if kind == MATRIX:
+                check_elements(file, position + 8, min(size, position + 8 + length), order)
+                file.seek(position + 8)
             position += 8 + length
             head = file.read(min(length, 4096))
             if kind == COMPRESSED:
@@ -97,6 +101,8 @@ def _walk(path: Path) -> tuple[int, dict[str, Variable]]:
                 head = head[8:]
             unpacked += length
             found = _variable(head, order)
+            if len(found.shape) > MOST_AXES or not (found.name.isascii() and (found.name + "_").isidentifier()):
+                raise RecordingError("the file is damaged: a variable has no name, or no shape; write it anew")
             variables[found.name] = found
     if position > size:
         raise RecordingError("the file ends in the middle of a variable: it was cut, copy it again")

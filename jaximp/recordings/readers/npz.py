@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ def read(path: Path, names: Sequence[str]) -> Found:
         for name, (head, _) in heads.items():
             if head not in file.files:
                 require_variable(head, _shapes(path), name)
+        _shapes(path, {head for head, _ in heads.values()})
         try:
             arrays = {head: file[head] for head, _ in heads.values()}
         except ValueError as error:
@@ -50,7 +52,11 @@ def _shapes(path: Path, wanted: Any = None) -> dict[str, tuple[int, ...]]:
             with archive.open(member) as opened:
                 first = npy.read_magic(opened) == (1, 0)
                 read_header = npy.read_array_header_1_0 if first else npy.read_array_header_2_0
-                shapes[name] = tuple(read_header(opened)[0])
+                shape, _, kind = read_header(opened)
+                held = archive.getinfo(member).file_size
+                if not kind.hasobject and math.prod(shape) * kind.itemsize > held:
+                    raise RecordingError(f"{name!r} says that it holds more than the file: write it anew")
+                shapes[name] = tuple(shape)
     return shapes
 
 

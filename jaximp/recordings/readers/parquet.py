@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.columns import head_of, pick, require, steps_of
 from jaximp.recordings.readers.found import COUNTED_FROM, Found
 
+NO_MACHINE_HAS = 1 << 44
+"""Bytes."""
 THREADS_PAY = 200_000
 """Rows of a file from which its columns are read at the same time: to hand over small ones takes longer."""
 
@@ -28,7 +31,12 @@ def read_feather(path: Path, names: Sequence[str]) -> Found:
     from pyarrow import feather
 
     with pyarrow.memory_map(str(path)) as source:
-        table = feather.read_table(source)
+        try:
+            table = feather.read_table(source)
+        except pyarrow.ArrowMemoryError as error:
+            if max(map(int, re.findall(r"\d+", str(error))), default=0) < NO_MACHINE_HAS:
+                raise
+            raise RecordingError("says that it holds more than any memory: it is damaged, copy it again") from None
         return columns_of_table(table, names)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaximp.recordings.errors import RecordingError
+from jaximp.recordings.readers.claims import check_mcap
 from jaximp.recordings.readers.columns import require
 from jaximp.recordings.readers.found import Found
 from jaximp.recordings.readers.library import library
@@ -50,6 +51,8 @@ def read(path: Path, names: Sequence[str]) -> Found:
 def _opened(path: Path) -> Any:
     highlevel = library("rosbags.highlevel", "rosbags", path.suffix)
     typesys = library("rosbags.typesys", "rosbags", path.suffix)
+    if path.suffix == ".mcap":
+        check_mcap(path)
     folder = path.parent if path.suffix != ".bag" and (path.parent / "metadata.yaml").exists() else path
     return highlevel.AnyReader([folder], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
 
