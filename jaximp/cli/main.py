@@ -26,7 +26,7 @@ from jaximp.cli.init import init
 from jaximp.cli.monitor import monitor
 from jaximp.cli.posterior import posterior
 from jaximp.cli.reproduce import reproduce
-from jaximp.cli.signals import Stopped, hear_signals, signals_obeyed
+from jaximp.cli.signals import Stopped, signals_heard
 from jaximp.cli.simulate import simulate
 from jaximp.cli.terminal import console
 
@@ -47,11 +47,10 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; bad input ends in one line and exit status 1, a signal in another and its own status."""
-    hear_signals()
     try:
-        app()
+        with signals_heard():
+            app()
     except Stopped as stopped:
-        signals_obeyed()
         console.print("interrupted")
         sys.stdout.flush()
         os._exit(int(stopped.code or 0))  # all is cleaned up; threads that still compile would crash while Python ends

@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 PATIENCE = 0.5
@@ -19,21 +21,28 @@ class Stopped(SystemExit):
     """A signal asked to end; the exit status is 128 and its number, as shells have it."""
 
 
-def hear_signals() -> None:
-    """Raise `Stopped` on SIGINT and SIGTERM; a signal that is ignored stays so, as in a job in the background."""
+@contextmanager
+def signals_heard() -> Iterator[None]:
+    """Raise `Stopped` on SIGINT and SIGTERM; a signal that is ignored stays so, as in a job in the background. What was
+    done with signals before is done again afterwards."""
     if threading.current_thread() is not threading.main_thread():
+        yield
         return
+    _ended.clear()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     say = sys.unraisablehook
     # One that is dropped is raised again, and nobody need read of it.
     sys.unraisablehook = lambda about: None if isinstance(about.exc_value, Stopped) else say(about)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
             signal.signal(number, _stop)
-
-
-def signals_obeyed() -> None:
-    """The exception has arrived: nothing is raised once more."""
-    _ended.set()
+    try:
+        yield
+    finally:
+        _ended.set()
+        sys.unraisablehook = say
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _stop(number: int, frame: Any) -> None:

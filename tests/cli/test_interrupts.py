@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import command_line
 from paths import ROOT
 
 HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -19,17 +20,17 @@ HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
 PROGRAM = [sys.executable, "-c", f"{HEARD}from jaximp.cli.main import main; main()"]
 LOSES_IT = f"""{HEARD}
 import gc, time
-from jaximp.cli.signals import hear_signals
-hear_signals()
+from jaximp.cli.signals import signals_heard
 def lose(phase, about):
     gc.callbacks.remove(lose)
     signal.raise_signal(NUMBER)
     for _ in range(10_000):
         pass
-gc.callbacks.append(lose)
-gc.collect()
-print("lost", flush=True)
-time.sleep(60)
+with signals_heard():
+    gc.callbacks.append(lose)
+    gc.collect()
+    print("lost", flush=True)
+    time.sleep(60)
 """
 
 
@@ -73,3 +74,9 @@ def test_a_signal_that_python_drops_is_raised_again(number: signal.Signals) -> N
     status, said, _ = ended(subprocess.Popen([sys.executable, "-c", code], **pipes))
     assert said == "lost\n"
     assert status == 128 + number
+
+
+def test_a_command_inside_somebodys_program_leaves_its_signals_alone() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM), sys.unraisablehook
+    assert command_line.jaximp("--version") == 0
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM), sys.unraisablehook) == before
