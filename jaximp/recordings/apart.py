@@ -12,7 +12,7 @@ import numpy as np
 from jaximp.recordings.channels import CHANNELS, Signal
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.grid import GAP, check_stamps
-from jaximp.types import Numbers
+from jaximp.recordings.readers.columns import values_at
 
 FEWEST = 3
 """Samples that a channel shares with the recording, at least."""
@@ -75,7 +75,7 @@ def joined(channel: str, signal: Signal, own: Signal, clock: Signal, path: Path)
             f"{channel}: {path.name} is from {stamps[0]:.6g} to {stamps[-1]:.6g} s and the recording from {at[0]:.6g} "
             f"to {at[-1]:.6g} s: both need times of one clock (a delay = ... in the table would move the channel)"
         )
-    values = np.column_stack([_at(at, stamps, column) for column in signal.values.T])
+    values = np.column_stack([values_at(at, stamps, column, GAP) for column in signal.values.T])
     interval, usual = np.median(np.diff(stamps)), np.median(np.diff(at))
     note = f"{channel} is that of {path.name}, joined on the time of the recording, linearly between its samples"
     notes = [f"{note}; they share {at[inside][-1] - at[inside][0]:.6g} s"]
@@ -85,11 +85,3 @@ def joined(channel: str, signal: Signal, own: Signal, clock: Signal, path: Path)
             f"{0.5 / interval:.3g} Hz is in it, and filters must cut below"
         )
     return replace(signal, values=values), notes
-
-
-def _at(at: Numbers, stamps: Numbers, values: Numbers) -> Numbers:
-    """Values at other times, NaN outside and in gaps."""
-    found = np.interp(at, stamps, values, left=np.nan, right=np.nan)
-    after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
-    wide = stamps[after] - stamps[after - 1] > GAP * np.median(np.diff(stamps))
-    return np.where(wide & (at > stamps[after - 1]) & (at < stamps[after]), np.nan, found)

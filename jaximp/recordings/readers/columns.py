@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaximp.recordings.errors import RecordingError
-from jaximp.types import nearest
+from jaximp.types import Numbers, nearest
 
 MOST_COLUMNS = 1000
 """A variable that is longer than this along both axes is no recording."""
@@ -152,3 +152,14 @@ def largest(shapes: dict[str, tuple[int, ...]], names: list[str]) -> int:
         if len(shape) > 1 and sorted(shape)[-2] > MOST_COLUMNS:
             raise RecordingError(f"{name!r} has shape {shape}: a recording has (samples, joints)")
     return max((max(shape, default=0) for shape in wanted.values()), default=0)
+
+
+def values_at(at: Numbers, stamps: Numbers, values: Numbers, gap: float) -> Numbers:
+    """Values at other times, linearly between samples whose `stamps` increase: NaN outside, and in what is longer than
+    `gap` usual intervals."""
+    found = np.interp(at, stamps, values, left=np.nan, right=np.nan)
+    if len(stamps) > 1:
+        after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
+        wide = stamps[after] - stamps[after - 1] > gap * np.median(np.diff(stamps))
+        found[wide & (at > stamps[after - 1]) & (at < stamps[after])] = np.nan
+    return found

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaximp.recordings.errors import RecordingError
 from jaximp.recordings.readers.claims import check_mcap
-from jaximp.recordings.readers.columns import require
+from jaximp.recordings.readers.columns import require, values_at
 from jaximp.recordings.readers.found import Found
 from jaximp.recordings.readers.library import library
 from jaximp.types import Numbers
@@ -43,7 +43,9 @@ def read(path: Path, names: Sequence[str]) -> Found:
     for name, (topic, field) in of.items():
         stamps, columns = series[topic or wanted[0]]
         column = (stamps - start) / 1e9 if field == "time" else columns[field]
-        values[name] = column if stamps is base else _joined((base - start) / 1e9, (stamps - start) / 1e9, column)
+        at, own = (base - start) / 1e9, (stamps - start) / 1e9
+        order = np.argsort(own, kind="stable")
+        values[name] = column if stamps is base else values_at(at, own[order], column[order], GAP)
     notes += [f"{topic} is joined on it, linearly between its {len(series[topic][0])} messages" for topic in wanted[1:]]
     return Found(values, notes=tuple(notes))
 
@@ -106,18 +108,6 @@ def _number(message: Any, field: str, topic: str) -> float:
     if not isinstance(value, int | float | np.number):
         raise RecordingError(f"{topic}.{field} is no number; name a part of it, such as {topic}.{field}[1]")
     return float(value)
-
-
-def _joined(at: Numbers, stamps: Numbers, values: Numbers) -> Numbers:
-    """Values at other times, NaN outside and in gaps."""
-    order = np.argsort(stamps, kind="stable")
-    stamps, values = stamps[order], values[order]
-    joined = np.interp(at, stamps, values, left=np.nan, right=np.nan)
-    if len(stamps) > 1:
-        after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
-        wide = stamps[after] - stamps[after - 1] > GAP * np.median(np.diff(stamps))
-        joined[wide & (at > stamps[after - 1]) & (at < stamps[after])] = np.nan
-    return joined
 
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
