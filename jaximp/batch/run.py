@@ -149,9 +149,9 @@ def run_plan(
     _prepare_folder(out, resume, plan.items)
     task, outcome = Task.of(job, plan, out, chosen), Outcome(recordings=len(plan.items))
     with _alone_in(out), _log(out, tell) as log, _signals_heard() as check:
-        log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
-        left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
         try:
+            log({"event": "plan", "recordings": len(plan.items), "batches": len(plan.batches)})
+            left = _sweep(task, plan, outcome, log) if resume else list(plan.batches)
             _follow(solved(task, left, workers, scheduler, check), outcome, log)
             check()
         except (KeyboardInterrupt, SystemExit):
