@@ -137,6 +137,8 @@ def _say_result(estimates: Estimates) -> None:
         said = f"{mean:11.4g} {spread} {unit}" if math.isfinite(mean) else f"{'-':>11} not to be trusted"
         if name in shown.changed and math.isfinite(mean):
             said = f"{'not one value':>13}: {shown.changed[name]}"
+        elif (ends := shown.range_of(name)) is not None and math.isfinite(mean):
+            said = f"{'not one value':>13}: between {ends[0]:.3g} and {ends[1]:.3g} {unit} in nine of ten {kind}s"
         elif name in loose:
             said += f", not determined{_how_loose(shown, loose[name])}"
         typer.echo(f"{name:>{width}} {said}")

@@ -49,6 +49,11 @@ class Reflex:
     """(M,) mean lag by weight [s]; NaN where the gain is within two standard errors of zero."""
 
 
+SCATTERED = 0.25
+"""Share of intervals of 95 % beside a value from which on it does not stand for all of them: windows overlap, and where
+one interval misses the truth by chance its neighbours do."""
+
+
 @dataclass(frozen=True)
 class HumanPart:
     """One human joint among the parameters of an `Estimates`."""
@@ -320,6 +325,21 @@ class Estimates(Result):
     def sd_over_trusted(self) -> NDArray[np.float64]:
         """(p,) standard deviation of each parameter over the same windows; NaN if there are none."""
         return np.array([column.std() if len(column) else np.nan for column in self._trusted_columns()])
+
+    def range_of(self, name: str) -> tuple[float, float] | None:
+        """Between which values nine of ten of the trusted estimates of a parameter are, where no value lies within
+        nearly all of their intervals, so that a mean would stand for none; None where one does."""
+        k = self.names.index(name)
+        trusted = self.trusted_in(name)
+        value, (low, high) = self.value[trusted, k], (end[trusted, k] for end in self.interval())
+        half = np.maximum((high - low) / 2, np.finfo(float).tiny)
+        if len(value) < 2 or not np.isfinite(half).all():
+            return None
+        mean = (value / half**2).sum() / (1 / half**2).sum()
+        if np.mean(np.abs(value - mean) > half) < SCATTERED:
+            return None
+        ends = np.quantile(value, [0.05, 0.95])
+        return float(ends[0]), float(ends[1])
 
     def undetermined(self) -> dict[str, float]:
         """Parameters that the data do not determine, and how far from it they are.

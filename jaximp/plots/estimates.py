@@ -334,6 +334,9 @@ def _mean_over_trusted(estimates: Estimates, k: int, brief: bool = False) -> tup
         return "none trusted" if brief else f"no {estimates.kind} can be trusted", VERMILLION
     if estimates.names[k] in estimates.changed:
         return estimates.changed[estimates.names[k]].how, BLUE
+    ends = estimates.range_of(estimates.names[k])
+    if ends is not None:
+        return " to ".join(number(end, 3) for end in ends), BLUE
     return f"mean{'' if brief else ' over trusted'} {number(estimates.mean_over_trusted()[k], 3 if brief else 4)}", BLUE
 
 

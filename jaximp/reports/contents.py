@@ -28,10 +28,6 @@ from jaximp.types import Recording
 if TYPE_CHECKING:
     import pyarrow as pa
 
-SCATTERED = 0.25
-"""Share of intervals of 95 % beside a value from which on it does not stand for all of them: windows overlap, and where
-one interval misses the truth by chance its neighbours do."""
-
 
 def summary(
     estimates_list: Sequence[Estimates], job: WindowJob, recording: Recording, lengths: Sequence[Estimates] = ()
@@ -171,7 +167,7 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
     theta, stderr = np.asarray(fit.theta) * factor, np.asarray(fit.stderr) * factor
     low, high = confidence_interval(theta, stderr, fit.dof)
     for k, (name, unit) in enumerate(zip(estimates.names, estimates.units, strict=True)):
-        trusted = estimates.trusted_in(name)
+        trusted, ends = estimates.trusted_in(name), estimates.range_of(name)
         found[name] = {
             "unit": unit,
             "trusted_share": float(trusted.mean()),
@@ -180,8 +176,7 @@ def _parameters(estimates: Estimates, factor: NDArray[np.float64]) -> dict[str, 
             "changed": _course(estimates.changed.get(name), factor[k]),
             "mean": _mean(theta[trusted, k]),
             "sd": _spread(theta[trusted, k]),
-            "from_to_90": _ends(theta[trusted, k]),
-            "one_value": _one_value(theta[trusted, k], low[trusted, k], high[trusted, k]),
+            "from_to_90": None if ends is None else [factor[k] * end for end in ends],
             "median_stderr": _median(stderr[trusted, k]),
             "half_width_95": _median((high - low)[trusted, k] / 2),
         } | _of_chain(estimates, k)
@@ -272,20 +267,6 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 def _median(values: NDArray[np.float64]) -> float:
     return float(np.median(values)) if len(values) else math.nan
-
-
-def _one_value(value: NDArray[np.float64], low: Any, high: Any) -> bool:
-    """Whether one value lies within nearly all of the intervals; each counts by how narrow it is."""
-    half = np.maximum((np.asarray(high) - np.asarray(low)) / 2, np.finfo(float).tiny)
-    if len(value) < 2 or not np.isfinite(half).all():
-        return True
-    mean = (value / half**2).sum() / (1 / half**2).sum()
-    return float(np.mean(np.abs(value - mean) > half)) < SCATTERED
-
-
-def _ends(values: NDArray[np.float64]) -> list[float]:
-    """Between which values nine of ten are."""
-    return np.quantile(values, [0.05, 0.95]).tolist() if len(values) else [math.nan, math.nan]
 
 
 def _spread(values: NDArray[np.float64]) -> float:

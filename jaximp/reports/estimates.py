@@ -305,7 +305,7 @@ def _answer(content: dict[str, Any]) -> list[Part]:
 
 def _spreads(value: Mapping[str, Any]) -> bool:
     """Whether the mean of a parameter stands for no single moment."""
-    return value["changed"] is not None or not value["one_value"]
+    return value["changed"] is not None or value["from_to_90"] is not None
 
 
 def _in_words(value: Mapping[str, Any]) -> str:

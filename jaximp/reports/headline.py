@@ -37,7 +37,7 @@ def headline(result: Mapping[str, Any]) -> str:
     elif steady:
         told.append(f"No change beyond error and 5 % was found of {_named(steady)}.")
     elif result["windows"]["count"] > 1:
-        told.append("Whether more changes cannot be told." if told[1:] else "Whether it changes cannot be told.")
+        told.append("Whether parameters change cannot be told: too few windows share no samples.")
     loose = [name for name, one in parameters.items() if one["mean"] is not None and not one["determined"]]
     doubted = [name for name, one in parameters.items() if one["mean"] is None]
     told += [f"This motion does not determine {_named(loose)}."] if loose else []
@@ -103,7 +103,7 @@ def _changes(name: str, one: Mapping[str, Any]) -> str:
 
 def _is_open(one: Mapping[str, Any]) -> bool:
     """Whether no value stands for a parameter that was not asked for changes, such as a constant torque."""
-    return one["changed"] is None and not one["steady"] and not one["one_value"]
+    return one["changed"] is None and not one["steady"] and one["from_to_90"] is not None
 
 
 def _range(name: str, one: Mapping[str, Any], kind: str) -> str:

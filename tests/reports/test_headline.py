@@ -12,7 +12,7 @@ from jaximp.trust.verdicts import TRUSTED, WEAK
 
 def parameter(mean: float | None, **more: Any) -> dict[str, Any]:
     plain = {"unit": "N m/rad", "half_width_95": 0.5, "determined": True, "steady": False, "changed": None}
-    plain |= {"one_value": True, "from_to_90": [-6.0, -3.0]}
+    plain |= {"from_to_90": None}
     return plain | {"mean": mean} | more
 
 
@@ -47,7 +47,7 @@ def test_where_nothing_changes_one_value_stands_for_all() -> None:
 
 
 def test_what_was_not_compared_and_is_no_one_value_is_told_as_a_range() -> None:
-    found = {"stiffness": parameter(60.0, steady=True), "offset_torque": parameter(-4.5, one_value=False)}
+    found = {"stiffness": parameter(60.0, steady=True), "offset_torque": parameter(-4.5, from_to_90=[-6.0, -3.0])}
     said = headline(result(**found))
     assert "Offset torque is between −6 and −3 N m/rad in nine of ten windows." in said
 
@@ -63,7 +63,7 @@ def test_of_a_path_it_is_said_what_is_open() -> None:
 
 def test_of_too_few_windows_no_change_is_denied() -> None:
     assert headline(result(1, stiffness=parameter(60.0))) == "Stiffness is 60 N m/rad (± 0.5, 95 %)."
-    assert headline(result(2, stiffness=parameter(60.0))).endswith("Whether it changes cannot be told.")
+    assert headline(result(2, stiffness=parameter(60.0))).endswith("too few windows share no samples.")
 
 
 def test_what_is_not_known_is_said_and_never_told() -> None:
