@@ -90,8 +90,10 @@ def _walk(path: Path) -> tuple[int, dict[str, Variable]]:
         while position < size:
             file.seek(position)
             kind, length = (int.from_bytes(file.read(4), order) for _ in range(2))
+            if position + 8 + length > size:
+                raise RecordingError("the file ends in the middle of a variable: it was cut, copy it again")
             if kind == MATRIX:
-                check_elements(file, position + 8, min(size, position + 8 + length), order)
+                check_elements(file, position + 8, position + 8 + length, order)
                 file.seek(position + 8)
             position += 8 + length
             head = file.read(min(length, 4096))
@@ -104,8 +106,6 @@ def _walk(path: Path) -> tuple[int, dict[str, Variable]]:
             if len(found.shape) > MOST_AXES or not (found.name.isascii() and (found.name + "_").isidentifier()):
                 raise RecordingError("the file is damaged: a variable has no name, or no shape; write it anew")
             variables[found.name] = found
-    if position > size:
-        raise RecordingError("the file ends in the middle of a variable: it was cut, copy it again")
     if not variables:
         raise RecordingError("cannot be read as .mat (it holds no variables): write it anew")
     return unpacked, variables
