@@ -7,6 +7,7 @@ the joints resist it with is felt at the hand as `J^-T A J^-1`: Börner et al. 2
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -57,7 +58,7 @@ def endpoint_stiffness(
     """
     K = jnp.asarray(K)
     if force is not None:
-        K = K - _turning(geometry, q, jnp.asarray(force))
+        K = K - _turning(geometry.jacobian(q), jnp.asarray(force))
     return _at_the_hand(geometry, q, K)
 
 
@@ -108,12 +109,18 @@ class Ellipse(eqx.Module):
 
     def outline(self, n: int = 200) -> Float[Array, "*N n 2"]:
         """Points around the ellipse; the last one is the first one again."""
-        turn = jnp.linspace(0, 2 * jnp.pi, n)
-        along, across = self.major[..., None] * jnp.cos(turn), self.minor[..., None] * jnp.sin(turn)
-        cosine, sine = jnp.cos(self.orientation)[..., None], jnp.sin(self.orientation)[..., None]
-        return jnp.stack([cosine * along - sine * across, sine * along + cosine * across], axis=-1)
+        return _outline(self, n)
 
 
+@partial(jax.jit, static_argnums=1)
+def _outline(one: Ellipse, n: int) -> Array:
+    turn = jnp.linspace(0, 2 * jnp.pi, n)
+    along, across = one.major[..., None] * jnp.cos(turn), one.minor[..., None] * jnp.sin(turn)
+    cosine, sine = jnp.cos(one.orientation)[..., None], jnp.sin(one.orientation)[..., None]
+    return jnp.stack([cosine * along - sine * across, sine * along + cosine * across], axis=-1)
+
+
+@jax.jit
 def ellipse(matrix: Num[AnyArray, "*N 2 2"]) -> Ellipse:
     """Size, shape and orientation of an endpoint stiffness (damping, inertia), as Mussa-Ivaldi et al. 1985 define them.
 
@@ -147,18 +154,22 @@ def propagated_stderr(
 
 def _at_the_hand(geometry: ArmGeometry, q: ArrayLike, matrix: AnyArray) -> Array:
     """`J^-T A J^-1`."""
-    across = jnp.swapaxes(geometry.jacobian(q), -1, -2)
+    return _transformed(geometry.jacobian(q), jnp.asarray(matrix))
 
-    def transformed(A: Array) -> Array:
+
+@jax.jit
+def _transformed(J: Array, matrix: Array) -> Array:
+    across = jnp.swapaxes(J, -1, -2)
+
+    def from_the_left(A: Array) -> Array:
         return jnp.stack([solve_pair(across, column) for column in (A[..., 0], A[..., 1])], axis=-1)
 
-    left = transformed(jnp.asarray(matrix))
-    return jnp.swapaxes(transformed(jnp.swapaxes(left, -1, -2)), -1, -2)
+    return jnp.swapaxes(from_the_left(jnp.swapaxes(from_the_left(matrix), -1, -2)), -1, -2)
 
 
-def _turning(geometry: ArmGeometry, q: ArrayLike, force: Array) -> Array:
+@jax.jit
+def _turning(J: Array, force: Array) -> Array:
     """How the torque of a constant force changes as the arm moves [N m/rad]: minus the force along the links."""
-    J = geometry.jacobian(q)
     along = J[..., 0, :] * force[..., 1, None] - J[..., 1, :] * force[..., 0, None]
     first, second = along[..., 0], along[..., 1]
     return jnp.stack([jnp.stack([first, second], axis=-1), jnp.stack([second, second], axis=-1)], axis=-2)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
@@ -17,6 +19,10 @@ from jaximp.types import AnyArray
 
 ROUNDING = 16
 """How many roundings beyond the reach, as a share of its square, still count as a straight or a folded arm."""
+
+
+Pair = tuple[Any, Any]
+"""Two numbers, which may be traced."""
 
 
 class ArmGeometry(eqx.Module):
@@ -58,11 +64,7 @@ class ArmGeometry(eqx.Module):
 
     def jacobian(self, q: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2 2"]:
         """`J` [m/rad] with `dx = J dq`; singular where the arm is straight or folded."""
-        (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
-        l1, l2 = self.lengths
-        of_x = jnp.stack([-l1 * sine1 - l2 * sine, -l2 * sine], axis=-1)
-        of_y = jnp.stack([l1 * cosine1 + l2 * cosine, l2 * cosine], axis=-1)
-        return jnp.stack([of_x, of_y], axis=-2)
+        return _jacobian(jnp.asarray(q), self.lengths)
 
     def velocity(self, q: Num[ArrayLike, "... 2"], dq: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Velocity of the hand [m/s] at the angles `q` [rad] and velocities `dq` [rad/s] of the joints."""
@@ -72,8 +74,8 @@ class ArmGeometry(eqx.Module):
         self, q: Num[ArrayLike, "... 2"], dq: Num[ArrayLike, "... 2"], ddq: Num[ArrayLike, "... 2"]
     ) -> tuple[Float[Array, "... 2"], Float[Array, "... 2"], Float[Array, "... 2"]]:
         """Position of the hand [m], velocity and acceleration from those of the joints [rad]."""
-        turned = self.velocity(q, ddq)
-        return self.forward(q), self.velocity(q, dq), turned - self._centripetal(q, dq)
+        towards = _centripetal(jnp.asarray(q), jnp.asarray(dq), self.lengths)
+        return self.forward(q), self.velocity(q, dq), self.velocity(q, ddq) - towards
 
     def joint_motion(
         self, x: Num[ArrayLike, "... 2"], v: Num[ArrayLike, "... 2"], a: Num[ArrayLike, "... 2"]
@@ -83,21 +85,11 @@ class ArmGeometry(eqx.Module):
         **Raises:** as `inverse`.
         """
         q = self.inverse(x)
-        J = self.jacobian(q)
-        dq = solve_pair(J, jnp.asarray(v))
-        return q, dq, solve_pair(J, jnp.asarray(a) + self._centripetal(q, dq))
-
-    def _centripetal(self, q: ArrayLike, dq: ArrayLike) -> Array:
-        """Acceleration of the hand towards the joints [m/s^2], at constant velocities of the joints: `-dJ/dt dq`."""
-        (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
-        first = jnp.asarray(dq)[..., 0]
-        upper = self.lengths[0] * first**2
-        fore = self.lengths[1] * (first + jnp.asarray(dq)[..., 1]) ** 2
-        return jnp.stack([upper * cosine1 + fore * cosine, upper * sine1 + fore * sine], axis=-1)
+        return q, *_joint_rates(q, jnp.asarray(v), jnp.asarray(a), self.lengths)
 
     def joint_torque(self, q: Num[ArrayLike, "... 2"], force: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Torques of the joints [N m] that a force on the hand [N] makes, `J' force`: Börner et al. 2020, eq. (23)."""
-        return (self.jacobian(q) * jnp.asarray(force)[..., :, None]).sum(axis=-2)
+        return _joint_torque(self.jacobian(q), jnp.asarray(force))
 
     def inverse(self, x: Num[ArrayLike, "... 2"]) -> Float[Array, "... 2"]:
         """Angles [rad] that bring the hand to `x` [m]; a position that is NaN has angles that are NaN.
@@ -111,23 +103,11 @@ class ArmGeometry(eqx.Module):
 
         **Source:** Börner et al. 2020, eqs. (21) and (22), with the quadrant of every angle.
         """
-        x = jnp.asarray(x)
-        x = jnp.stack([x[..., k] - self.shoulder[k] for k in (0, 1)], axis=-1)
-        l1, l2 = self.lengths
-        squared = (x * x).sum(axis=-1)
-        beyond, within = (l1 + l2) ** 2 - squared, squared - (l1 - l2) ** 2
-        slack = ROUNDING * float(jnp.finfo(jnp.result_type(x, float)).eps) * (l1 + l2) ** 2
-        unreachable = (beyond < -slack) | (within < -slack)
-        if not is_traced(unreachable) and bool(unreachable.any()):
-            raise ValueError(self._out_of_reach(np.asarray(x), np.asarray(unreachable)))
-        # Twice the forearm in the frame of the upper arm; across it by Heron's formula for the area of the triangle.
-        along = (squared - l1**2 - l2**2) / l1
         side = 1.0 if self.elbow == "right" else -1.0
-        across = side * jnp.sqrt(jnp.maximum(beyond, 0.0) * jnp.maximum(within, 0.0)) / l1
-        hand = 2 * l1 + along
-        shoulder = jnp.arctan2(x[..., 1] * hand - x[..., 0] * across, x[..., 0] * hand + x[..., 1] * across)
-        angles = jnp.stack([shoulder, jnp.arctan2(across, along)], axis=-1)
-        return jnp.where(unreachable[..., None], jnp.nan, angles)
+        angles, unreachable = _angles(jnp.asarray(x), self.shoulder, self.lengths, side)
+        if not is_traced(unreachable) and bool(unreachable.any()):
+            raise ValueError(self._out_of_reach(np.asarray(x) - self.shoulder, np.asarray(unreachable)))
+        return angles
 
     def _out_of_reach(self, x: np.ndarray, unreachable: np.ndarray) -> str:
         l1, l2 = self.lengths
@@ -139,6 +119,54 @@ class ArmGeometry(eqx.Module):
             f"{count} cannot be reached: ({px:g}, {py:g}) m{where} is {np.hypot(px, py):.6g} m from the shoulder, and "
             f"an arm of {l1:g} m and {l2:g} m reaches from {abs(l1 - l2):.6g} m to {l1 + l2:.6g} m"
         )
+
+
+@jax.jit
+def _jacobian(q: Array, lengths: Pair) -> Array:
+    (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
+    l1, l2 = lengths
+    of_x = jnp.stack([-l1 * sine1 - l2 * sine, -l2 * sine], axis=-1)
+    of_y = jnp.stack([l1 * cosine1 + l2 * cosine, l2 * cosine], axis=-1)
+    return jnp.stack([of_x, of_y], axis=-2)
+
+
+@jax.jit
+def _joint_rates(q: Array, v: Array, a: Array, lengths: Pair) -> tuple[Array, Array]:
+    J = _jacobian(q, lengths)
+    dq = solve_pair(J, v)
+    return dq, solve_pair(J, a + _centripetal(q, dq, lengths))
+
+
+@jax.jit
+def _joint_torque(J: Array, force: Array) -> Array:
+    return (J * force[..., :, None]).sum(axis=-2)
+
+
+@jax.jit
+def _centripetal(q: Array, dq: Array, lengths: Pair) -> Array:
+    """Acceleration of the hand towards the joints [m/s^2], at constant velocities of the joints: `-dJ/dt dq`."""
+    (sine1, cosine1), (sine, cosine) = _upper_arm_and_forearm(q)
+    first = dq[..., 0]
+    upper, fore = lengths[0] * first**2, lengths[1] * (first + dq[..., 1]) ** 2
+    return jnp.stack([upper * cosine1 + fore * cosine, upper * sine1 + fore * sine], axis=-1)
+
+
+@jax.jit
+def _angles(x: Array, shoulder: Pair, lengths: Pair, side: Any) -> tuple[Array, Array]:
+    """Angles of `ArmGeometry.inverse`, and which positions have none."""
+    x = jnp.stack([x[..., k] - shoulder[k] for k in (0, 1)], axis=-1)
+    l1, l2 = lengths
+    squared = (x * x).sum(axis=-1)
+    beyond, within = (l1 + l2) ** 2 - squared, squared - (l1 - l2) ** 2
+    slack = ROUNDING * float(jnp.finfo(jnp.result_type(x, float)).eps) * (l1 + l2) ** 2
+    unreachable = (beyond < -slack) | (within < -slack)
+    # Twice the forearm in the frame of the upper arm; across it by Heron's formula for the area of the triangle.
+    along = (squared - l1**2 - l2**2) / l1
+    across = side * jnp.sqrt(jnp.maximum(beyond, 0.0) * jnp.maximum(within, 0.0)) / l1
+    hand = 2 * l1 + along
+    first = jnp.arctan2(x[..., 1] * hand - x[..., 0] * across, x[..., 0] * hand + x[..., 1] * across)
+    angles = jnp.stack([first, jnp.arctan2(across, along)], axis=-1)
+    return jnp.where(unreachable[..., None], jnp.nan, angles), unreachable
 
 
 def _upper_arm_and_forearm(q: ArrayLike) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

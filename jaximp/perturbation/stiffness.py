@@ -83,13 +83,12 @@ class LinearFit(eqx.Module):
     @property
     def theta(self) -> Float[Array, "*B p"]:
         """`ELEMENTS`, or where K is symmetric `SYMMETRIC_ELEMENTS`."""
-        full = jnp.concatenate([self.D.reshape(*self.D.shape[:-2], 4), self.K.reshape(*self.K.shape[:-2], 4)], axis=-1)
-        return full[..., _given(self.covariance.shape[-1])]
+        return _elements(self.D, self.K, self.covariance.shape[-1])
 
     @property
     def stderr(self) -> Float[Array, "*B p"]:
         """Standard errors of `theta`."""
-        return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return _standard_errors(self.covariance)
 
     def why(self) -> np.ndarray:
         """In words why each fit failed; empty where it did not."""
@@ -124,8 +123,8 @@ def residual_triangle(
     **Raises:** ValueError where float64 is off.
     """
     require_float64(displacement, velocity, torque)
-    columns = jnp.concatenate([jnp.asarray(x) for x in (velocity, displacement, torque)], axis=-1)
-    return _triangles(columns, jnp.ones(columns.shape[:-1], bool) if valid is None else jnp.asarray(valid, bool))
+    columns = [jnp.asarray(x) for x in (velocity, displacement, torque)]
+    return _triangles_of(columns, np.ones(columns[0].shape[:-1], bool) if valid is None else jnp.asarray(valid, bool))
 
 
 def merge_triangles(
@@ -243,6 +242,11 @@ def _batch(triangles: AnyArray, samples: AnyArray, counts: AnyArray | None) -> t
     shape = triangles.shape[:-2]
     counts = jnp.ones(shape, bool) if counts is None else jnp.asarray(counts, bool)
     return triangles, jnp.broadcast_to(jnp.asarray(samples), shape), counts
+
+
+@jax.jit
+def _triangles_of(columns: list[Array], valid: Array) -> Array:
+    return _triangles(jnp.concatenate(columns, axis=-1), valid)
 
 
 @jax.jit
@@ -377,6 +381,17 @@ def symmetric_matrix(elements: Num[AnyArray, "*N 3"]) -> Any:
 def _given(n: int) -> NDArray[np.int64]:
     """Which of `ELEMENTS` stand for the matrices."""
     return np.arange(8) if n == 8 else np.array([ELEMENTS.index(name) for name in SYMMETRIC_ELEMENTS])
+
+
+@partial(jax.jit, static_argnums=2)
+def _elements(D: Array, K: Array, n: int) -> Array:
+    """(*B, n) elements of the matrices (*B, 2, 2)."""
+    return jnp.concatenate([x.reshape(*x.shape[:-2], 4) for x in (D, K)], axis=-1)[..., _given(n)]
+
+
+@jax.jit
+def _standard_errors(covariance: Array) -> Array:
+    return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
 
 
 def _times(a: AnyArray, b: AnyArray) -> Array:

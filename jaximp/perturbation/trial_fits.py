@@ -55,14 +55,13 @@ def with_torques(
     perturbed: Trials, deviations: Deviations, arm: KnownArm, linearised: bool
 ) -> tuple[JointDeviations, list[Array]]:
     """Deviations of the joints, and the torques for an inertia that is one standard error larger in each parameter."""
-    joint = joint_deviations(perturbed, deviations, arm, linearised)
-    inertia = jnp.asarray(arm.inertia, float)
-    stderr = jnp.zeros(3) if arm.inertia_stderr is None else jnp.asarray(arm.inertia_stderr, float)
-    moved = []
-    for k in range(3):
-        other = KnownArm(arm.geometry, inertia.at[k].add(stderr[k]), arm.handle)
-        moved.append(joint_deviations(perturbed, deviations, other, linearised).torque)
-    return joint, moved
+    stderr = np.zeros(3) if arm.inertia_stderr is None else np.asarray(arm.inertia_stderr, float)
+    tried = np.asarray(arm.inertia, float) + np.vstack([np.zeros(3), np.diag(stderr)])
+    joint, *moved = (
+        joint_deviations(perturbed, deviations, KnownArm(arm.geometry, jnp.asarray(inertia), arm.handle), linearised)
+        for inertia in tried
+    )
+    return joint, [one.torque for one in moved]
 
 
 def as_given(own: Impedance) -> Fitted:
@@ -84,7 +83,7 @@ def fit_deviations(joint: JointDeviations, moved: Sequence[Array], linearised: b
     triangles = _triangles(joint, moved, np.ones(samples, bool))
     halves = np.arange(trials) % 2 == np.arange(2)[:, None]
     counts = np.concatenate([np.ones((4, trials), bool), halves])
-    batch = jnp.concatenate([triangles, triangles[:1], triangles[:1]])
+    batch = np.asarray(triangles)[[0, 1, 2, 3, 0, 0]]
     fit = _fit_batch(batch, np.full(len(counts), samples), counts, linearised)
     D, K, own = np.asarray(fit.D), np.asarray(fit.K), np.asarray(triangles[0])
     singular = isinstance(fit, StiffnessFit) and bool(fit.on_boundary[0])
@@ -123,8 +122,8 @@ def smallest_eigenvalue(K: Numbers) -> float:
 
 def _triangles(joint: JointDeviations, moved: Sequence[Array], inside: Bool[AnyArray, " S"]) -> Float[Array, "4 T 6 6"]:
     """Of the samples `inside` of the trials, with the torque for the given inertia first."""
-    torque = jnp.stack([joint.torque, *moved])
-    displacement, velocity = (jnp.broadcast_to(x, torque.shape) for x in (joint.displacement, joint.velocity))
+    torque = np.stack([joint.torque, *moved])
+    displacement, velocity = (np.broadcast_to(x, torque.shape) for x in (joint.displacement, joint.velocity))
     return residual_triangle(displacement, velocity, torque, jnp.broadcast_to(inside, torque.shape[:-1]))
 
 
@@ -140,8 +139,8 @@ def _fit_batch(
     """Fits of a batch, which is filled up to one size: all of them share their compiled code."""
     filled = np.resize(np.arange(len(samples)), BATCH)
     fit = fit_triangles_linear if linearised else fit_triangles
-    found = fit(jnp.asarray(triangles)[filled], samples[filled, None], counts=counts[filled])
-    return jax.tree.map(lambda x: x[: len(samples)], found)
+    found = fit(np.asarray(triangles)[filled], samples[filled, None], counts=counts[filled])
+    return jax.tree.map(lambda x: np.asarray(x)[: len(samples)], found)
 
 
 def _left_over(triangles: Numbers, D: Numbers, K: Numbers) -> tuple[float, float]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -15,6 +15,7 @@ from jaximp import plots
 from jaximp.jobs.job import TrialsJob
 from jaximp.models.endpoint import Ellipse, ellipse, endpoint_damping, endpoint_stiffness, propagated_stderr
 from jaximp.models.inertia import BASE_INERTIA
+from jaximp.models.kinematics import ArmGeometry
 from jaximp.perturbation.impedance import ArmImpedance
 from jaximp.perturbation.isolation.methods import METHODS
 from jaximp.perturbation.isolation.output_error import MISFIT
@@ -230,19 +231,25 @@ def endpoint(found: ArmImpedance) -> dict[str, Any]:
         content[f"{name}_{unit}"] = np.asarray(matrix).tolist()
         content[f"{name}_ellipse"] = _in_plain_numbers(ellipse(matrix))
         if name in MATRICES:
-            spread = propagated_stderr(
-                partial(_ellipse_of, found, name), jnp.asarray(found.theta), jnp.asarray(found.covariance)
-            )
+            angles, theta, covariance = (jnp.asarray(x) for x in (found.angles, found.theta, found.covariance))
+            spread = _ellipse_stderr(found.arm.geometry, angles, theta, covariance, found.names, name)
             content[f"{name}_ellipse_stderr"] = _in_plain_numbers(spread)
     return content
 
 
-def _ellipse_of(found: ArmImpedance, matrix: str, theta: Array) -> Ellipse:
+@eqx.filter_jit
+def _ellipse_stderr(
+    geometry: ArmGeometry, q: Array, theta: Array, covariance: Array, names: tuple[str, ...], matrix: str
+) -> Ellipse:
     """At the hand, of the damping or stiffness among estimates."""
-    at = {name: theta[k] for k, name in enumerate(found.names)}
-    rows = [[at.get(f"{matrix}_{i}{j}", at[f"{matrix}_12"]) for j in (1, 2)] for i in (1, 2)]
     of_hand = endpoint_damping if matrix == "damping" else endpoint_stiffness
-    return ellipse(of_hand(found.arm.geometry, jnp.asarray(found.angles), jnp.array(rows)))
+
+    def ellipse_of(theta: Array) -> Ellipse:
+        at = {name: theta[k] for k, name in enumerate(names)}
+        rows = [[at.get(f"{matrix}_{i}{j}", at[f"{matrix}_12"]) for j in (1, 2)] for i in (1, 2)]
+        return ellipse(of_hand(geometry, q, jnp.array(rows)))
+
+    return propagated_stderr(ellipse_of, theta, covariance)
 
 
 def in_words(name: str) -> str:

@@ -58,9 +58,8 @@ def filter_zero_phase(sos: Sections, x: Num[AnyArray, "N *k"]) -> Float[Array, "
     require_float64(x)
     x, sos = _floating(x), np.asarray(sos, np.float64)
     edge = _edge_within(sos, x.shape[0])
-    start, end = 2 * x[:1] - x[edge:0:-1], 2 * x[-1:] - x[-2 : -edge - 2 : -1]
-    y = _filter_from_rest(sos, jnp.concatenate([start, x, end]))
-    return _filter_from_rest(sos, y, backward=True)[edge:-edge]
+    by = padded_filter(tuple(map(tuple, sos.tolist())))
+    return _both_ways(jnp.asarray(by.sos, x.dtype), jnp.asarray(by.rest, x.dtype), x, edge)
 
 
 def filter_zero_phase_padded(
@@ -217,11 +216,12 @@ def _edge_within(sos: NDArray[np.float64], n: int) -> int:
     return edge
 
 
-def _filter_from_rest(sos: NDArray[np.float64], x: Array, backward: bool = False) -> Array:
-    """One pass in either direction, starting as if the sample it meets first had lasted for ever."""
-    from scipy.signal import sosfilt_zi
-
-    return _filter(jnp.asarray(sos, x.dtype), jnp.asarray(sosfilt_zi(sos), x.dtype), x, backward)
+@partial(jax.jit, static_argnames="edge")
+def _both_ways(sos: Array, rest: Array, x: Array, edge: int) -> Array:
+    """Each pass starts as if the sample it meets first had lasted for ever."""
+    start, end = 2 * x[:1] - x[edge:0:-1], 2 * x[-1:] - x[-2 : -edge - 2 : -1]
+    y = _filter(sos, rest, jnp.concatenate([start, x, end]), backward=False)
+    return _filter(sos, rest, y, backward=True)[edge:-edge]
 
 
 @partial(jax.jit, static_argnames="backward")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 from jaxtyping import Array
 
 from jaximp.perturbation.deviations import Deviations, KnownArm
@@ -19,8 +20,10 @@ def mean_of_perturbed(
     **Source:** Gomi and Kawato 1997, as in Börner et al. 2020, 1.1.
     """
 
-    def deviation(x: Array) -> Array:
-        return x[:, :1] + (x - x[:, :1]).mean(axis=0) - x
-
     seen = in_window(perturbed, window_samples(perturbed, window))
-    return Isolated(Deviations(*map(deviation, (seen.position, seen.velocity, seen.acceleration, seen.force))))
+    return Isolated(Deviations(*map(_deviation, (seen.position, seen.velocity, seen.acceleration, seen.force))))
+
+
+@jax.jit
+def _deviation(x: Array) -> Array:
+    return x[:, :1] + (x - x[:, :1]).mean(axis=0) - x
