@@ -19,8 +19,8 @@ from jaximp.motion.trajectories import FourierSeries, at_rest
 from jaximp.types import AnyArray, Numbers
 
 Three = tuple[Array, Array, Array]
-STEPS = 4
-"""Of the integration for each sample."""
+STEPS, STEP_RATE = 4, 1000
+"""Steps of the integration for each sample, at least, and how many a second [Hz], at least."""
 GRADUAL = 0.02
 """Velocity around which dry friction turns [rad/s or m/s]; a jump would need smaller steps."""
 REACH, SPEED, FARTHEST, FASTEST = 0.6, 0.6, 1.5, 2.0
@@ -111,8 +111,10 @@ def simulate_robot(
         raise ValueError(f"duration is {duration:g} s: it must last from 1 s to an hour")
     time = np.arange(round(duration * drive.rate)) / drive.rate
     theta = np.asarray(chain.base.map) @ np.asarray(parameters)
-    asked = motion(jnp.asarray(np.arange(STEPS * len(time)) / (STEPS * drive.rate)))
-    position, torque = (np.asarray(x)[::STEPS] for x in _follow(chain, theta, asked, drive, human))
+    steps = max(STEPS, int(np.ceil(STEP_RATE / drive.rate)))
+    asked = motion(jnp.asarray(np.arange(steps * len(time)) / (steps * drive.rate)))
+    found = _follow(chain, theta, asked, steps * drive.rate, drive.bandwidth, human)
+    position, torque = (np.asarray(x)[::steps] for x in found)
     random = np.random.default_rng(seed)
     effort = np.where(np.isfinite(chain.limits.effort), chain.limits.effort, np.abs(torque).max(axis=0))
     noise = drive.torque_noise * effort * random.normal(size=torque.shape)
@@ -124,7 +126,8 @@ def _follow(
     chain: Chain,
     theta: Numbers,
     asked: tuple[Array, ...],
-    drive: RobotDrive,
+    rate: float,
+    bandwidth: float,
     human: tuple[TipImpedance, Numbers] | None,
 ) -> tuple[Array, Array]:
     """(S, n) position and motor torque at every step, of a controller that expects the URDF's own torque."""
@@ -133,15 +136,15 @@ def _follow(
     if human is not None:
         model, true = model + human[0], jnp.concatenate([true, jnp.asarray(human[1], float)])
     size = _mass_and_rest(model, true, asked[0].mean(axis=0), jnp.zeros(chain.n_joints))[0].diagonal()
-    return _followed(model, true, size, (asked[0], asked[1], expected), drive.rate, drive.bandwidth)
+    return _followed(model, true, size, (asked[0], asked[1], expected), rate, bandwidth)
 
 
 @partial(jax.jit, static_argnums=(4, 5))
 def _followed(
     model: Model, theta: Array, size: Array, asked: Three, rate: float, bandwidth: float
 ) -> tuple[Array, Array]:
-    """By steps of semi-implicit Euler; the controller is a PID of each joint beside the torque that it expects."""
-    dt, omega = 1 / (STEPS * rate), 2 * jnp.pi * bandwidth
+    """By `rate` steps of semi-implicit Euler a second; the controller is a PID of each joint, and expects a torque."""
+    dt, omega = 1 / rate, 2 * jnp.pi * bandwidth
     proportional, integral, derivative = size * omega**2, size * omega**3 / 10, size * 2 * omega
 
     def step(state: Three, wanted: Three) -> tuple[Three, tuple[Array, Array]]:

@@ -43,6 +43,12 @@ def test_torque_is_that_of_the_motion(chain: Chain, recording: RobotRecording) -
     assert np.sqrt((error**2).mean()) < 0.01 * np.sqrt((torque**2).mean())
 
 
+def test_a_slow_recorder_sees_the_same_robot(chain: Chain, recording: RobotRecording) -> None:
+    slow = simulate_robot(chain, true_parameters(chain, 3), exciting_motion(chain, 4.0), 4.0, RobotDrive(rate=50), 1)
+    np.testing.assert_allclose(slow.true_position, recording.true_position[::5], atol=1e-9)
+    np.testing.assert_allclose(slow.true_torque, recording.true_torque[::5], atol=1e-6)
+
+
 @pytest.mark.slow  # compiles a simulation of its own
 def test_a_human_who_holds_it_takes_torque(chain: Chain) -> None:
     """What the motors need is the torque of the robot and of the human's impedance."""
